@@ -60,7 +60,7 @@ from laneweave.launch.bench.request_families import formation_request
 from laneweave.protocol.security.connection import Access
 from laneweave.protocol.transports.zenoh.transport import ZenohTransport
 from laneweave.protocol.wire.topics import SERVICE, Keys
-from laneweave.sim_bridge.recording.trips import percentiles_of
+from laneweave.sim_bridge.recording.statistics import percentiles_of
 
 LANEWEAVE = str(Path(sys.executable).with_name("laneweave"))
 REQUESTS, CLIENTS = 200, 20

@@ -38,7 +38,7 @@ from laneweave.launch.bench.tracker import SITUATIONS, drive
 from laneweave.protocol.config.scenario_files import load_scenario
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.motion import State
-from laneweave.sim_bridge.recording.trips import percentiles_of
+from laneweave.sim_bridge.recording.statistics import percentiles_of
 
 Array = NDArray[np.float64]
 

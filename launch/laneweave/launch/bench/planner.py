@@ -27,7 +27,7 @@ from laneweave.launch.bench.request_families import (
 )
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Mode
-from laneweave.sim_bridge.recording.trips import percentiles_of
+from laneweave.sim_bridge.recording.statistics import percentiles_of
 
 
 @attrs.frozen

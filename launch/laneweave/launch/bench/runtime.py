@@ -25,7 +25,7 @@ from laneweave.protocol.config.participants import coordinator_names
 from laneweave.protocol.config.scenario_files import load_scenario
 from laneweave.protocol.runtime.temporary_folders import temporary_folder
 from laneweave.protocol.scenario.fields import Scenario
-from laneweave.sim_bridge.recording.trips import percentiles_of
+from laneweave.sim_bridge.recording.statistics import percentiles_of
 
 ROLES = ("router", "coordinator", "bridge", "agent")
 CPU_PERIOD_S = 0.3

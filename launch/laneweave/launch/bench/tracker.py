@@ -24,7 +24,7 @@ from laneweave.agents.driving.tracker import Tracker, TrackResult
 from laneweave.agents.driving.tracking_problem import NO_GAPS, Gaps
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.motion import State, integrate
-from laneweave.sim_bridge.recording.trips import percentiles_of
+from laneweave.sim_bridge.recording.statistics import percentiles_of
 
 Array = NDArray[np.float64]
 

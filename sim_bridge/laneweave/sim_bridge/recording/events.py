@@ -16,7 +16,7 @@ from laneweave.protocol.scenario.formation_table import SOLVERS, solver_of_event
 from laneweave.protocol.summary import Planning, PlanningMs
 from laneweave.protocol.wire.events import PLAN_EVENTS
 from laneweave.sim_bridge.recording.disk import Disk
-from laneweave.sim_bridge.recording.trips import percentiles_of
+from laneweave.sim_bridge.recording.statistics import percentiles_of
 
 
 class Events:

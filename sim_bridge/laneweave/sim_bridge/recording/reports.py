@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from laneweave.protocol.summary import DurationMs
 from laneweave.protocol.wire.messages import Name, Report
-from laneweave.sim_bridge.recording.trips import finite
+from laneweave.sim_bridge.recording.statistics import finite
 
 MAX_SENDERS = 256
 """Number of senders whose newest reports are stored. An older report is final: by then, the vehicle

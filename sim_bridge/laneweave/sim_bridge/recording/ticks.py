@@ -13,7 +13,7 @@ from laneweave.protocol.summary import DurationMs
 from laneweave.sim_bridge.recording.columns import TICKS
 from laneweave.sim_bridge.recording.disk import Disk
 from laneweave.sim_bridge.recording.growing_parquet import GrowingParquet
-from laneweave.sim_bridge.recording.trips import percentiles_of
+from laneweave.sim_bridge.recording.statistics import percentiles_of
 
 ROWS_PER_GROUP = 3000
 """Number of rows that are written together."""

@@ -18,7 +18,7 @@ from laneweave.sim_bridge.bodies.overlaps_and_gaps import MinGaps
 from laneweave.sim_bridge.recording.columns import TRAJECTORIES, Metadata
 from laneweave.sim_bridge.recording.disk import Disk
 from laneweave.sim_bridge.recording.growing_parquet import GrowingParquet
-from laneweave.sim_bridge.recording.trips import finite
+from laneweave.sim_bridge.recording.statistics import finite
 
 ROWS_PER_GROUP = 100_000
 """Number of rows that are written together."""

@@ -15,7 +15,6 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from attrs import define
-from numpy.typing import NDArray
 
 from laneweave.protocol.config.scenario_files import to_tables
 from laneweave.protocol.scenario.fields import Scenario
@@ -25,6 +24,7 @@ from laneweave.protocol.wire.messages import Name
 from laneweave.sim_bridge.recording.columns import SCENARIO_KEY, TRIPS, Metadata
 from laneweave.sim_bridge.recording.disk import Disk
 from laneweave.sim_bridge.recording.growing_parquet import GrowingParquet
+from laneweave.sim_bridge.recording.statistics import finite, percentiles_of
 from laneweave.sim_bridge.road.demand import Arrival
 
 ROWS_PER_GROUP = 500
@@ -182,22 +182,3 @@ def throughput(trips: pa.Table, lanes: int) -> float | None:
     left_s = trips["left_s"].drop_null().to_numpy()
     passed = int(np.sum((counted_s.min() < left_s) & (left_s <= counted_s.max())))
     return finite(3600.0 * passed / float(np.ptp(counted_s)) / lanes)
-
-
-def finite(value: float) -> float | None:
-    """Return a number for JSON, rounded to three decimals; None for infinities and NaN."""
-    return round(value, 3) if math.isfinite(value) else None
-
-
-def percentiles_of(
-    values: NDArray[Any], *percentiles: int, largest: bool = False
-) -> dict[str, float | None]:
-    """Return percentiles by name (with `largest`, also `max`); None if there are no values."""
-    ranks = {f"p{percentile}": percentile for percentile in percentiles}
-    if largest:
-        ranks["max"] = 100
-    with np.errstate(all="ignore"):
-        return {
-            name: finite(float(np.percentile(values, rank))) if len(values) else None
-            for name, rank in ranks.items()
-        }

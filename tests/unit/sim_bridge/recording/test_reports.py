@@ -10,7 +10,7 @@ from laneweave.protocol.summary import DurationMs
 from laneweave.protocol.wire.messages import Name, Report
 from laneweave.sim_bridge.recording import reports as reports_module
 from laneweave.sim_bridge.recording.reports import MAX_SOLVE_MS, ReportTotals, SolveTimes
-from laneweave.sim_bridge.recording.trips import finite
+from laneweave.sim_bridge.recording.statistics import finite
 
 
 @pytest.mark.parametrize("senders", [1, 2, 9, 100])
