@@ -7,7 +7,7 @@ preset files, which are selected by name.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from importlib.resources import as_file, files
 from importlib.resources.abc import Traversable
 from pathlib import Path
@@ -30,6 +30,8 @@ GROUPS = tuple(SENDER_OF_GROUP)
 OTHERS = "others"
 ALL = "all"
 AUTO, NAMESPACES, MESSAGES = "auto", "namespaces", "messages"
+FaultSource = Mapping[str, Any] | Path | str | None
+"""Faults: tables, the path of a file, the name of a preset, or none."""
 MAX_BURST_LOSS = 0.5
 MIN_LOSS = 0.001
 MAX_PACKET_DELAY_S = 10.0
@@ -297,14 +299,15 @@ def preset_names() -> tuple[str, ...]:
 
 
 def load_faults(
-    choice: Path | str | None,
+    choice: FaultSource,
     coordinators: Collection[str],
     vehicles: Collection[str] | None = None,
 ) -> FaultSpec:
-    """Read a fault file or a preset.
+    """Return the faults of a file, a preset or tables.
 
     Args:
-        choice: path of a file, or the name of a preset if no such file exists; None: no faults.
+        choice: path of a file, or the name of a preset if no such file exists; tables as nested
+            mappings and sequences, as in a file; None: no faults.
         coordinators: names of the run's coordinators.
         vehicles: names of the run's vehicles; None: accept any vehicle name.
 
@@ -313,10 +316,18 @@ def load_faults(
     """
     if choice is None:
         return FaultSpec()
+    if isinstance(choice, Mapping):
+        return _faults(dict(choice), coordinators, vehicles)
     source = _source(choice)
     with source.located():
-        specification = structure(source.tables, FaultSpec)
-        raise_all(_unknown_targets(specification, coordinators, vehicles))
+        return _faults(source.tables, coordinators, vehicles)
+
+
+def _faults(
+    tables: dict[str, Any], coordinators: Collection[str], vehicles: Collection[str] | None
+) -> FaultSpec:
+    specification = structure(tables, FaultSpec)
+    raise_all(_unknown_targets(specification, coordinators, vehicles))
     return specification
 
 

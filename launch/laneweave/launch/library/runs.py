@@ -11,7 +11,7 @@ from typing import Any, Final, Literal
 
 from laneweave.agents.driving.trajectory import check_moves
 from laneweave.coordinator.planning.solve import prepare
-from laneweave.launch.faults.fault_file import load_faults
+from laneweave.launch.faults.fault_file import FaultSource, load_faults
 from laneweave.launch.report.report import draw_report
 from laneweave.launch.run.local_run import LocalRun, StartPage
 from laneweave.launch.run.logs import log_by_default
@@ -83,7 +83,7 @@ def run(
     out: Path | str | None = None,
     method: str = FORMATION,
     transport: Transport | None = None,
-    faults: Path | str | None = None,
+    faults: FaultSource = None,
     pace: float | None = None,
     report: bool = False,
     show_progress: bool = False,
@@ -103,7 +103,8 @@ def run(
         method: `formation`, `rule`, `lc2013`, or the name of a plug-in (`laneweave.methods`).
         transport: `zenoh` (default): router, coordinators, bridge and agents are processes on this
             machine; `simulated`: in this process, in virtual time, equal results for equal seeds.
-        faults: name of a preset or path of a fault file (docs/FAULTS.md).
+        faults: name of a preset, path of a fault file, or its tables as nested mappings
+            (docs/FAULTS.md).
         pace: mean road seconds per second; None: `runtime.max_pace`. Only over Zenoh.
         report: whether to draw the figures and `report.html`, as `laneweave run` does.
         show_progress: whether to show a progress bar on stderr.
@@ -121,7 +122,7 @@ def run(
         out=None if out is None else Path(out),
         method=method,
         transport=transport,
-        faults=None if faults is None else str(faults),
+        faults=faults,
         pace=pace,
         show_progress=show_progress,
     ).or_interrupt()
@@ -138,7 +139,7 @@ def perform_run(
     out: Path | None = None,
     method: str = FORMATION,
     transport: str | None = None,
-    faults: str | None = None,
+    faults: FaultSource = None,
     pace: float | None = None,
     show_progress: bool = False,
     announce: Callable[[str], None] = _ignore,
@@ -173,7 +174,7 @@ def perform_run(
 
 
 def _check_arguments(
-    method: str, transport: str | None, faults: str | None, pace: float | None
+    method: str, transport: str | None, faults: FaultSource, pace: float | None
 ) -> None:
     checked_method(method, "method")
     if transport not in (None, ZENOH, SIMULATED):
@@ -191,7 +192,7 @@ def _run_formations(
     scenario: Scenario,
     out: Path | None,
     transport: str | None,
-    faults: str | None,
+    faults: FaultSource,
     local: partial[LocalRun],
     *,
     show: bool,

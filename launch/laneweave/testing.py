@@ -1,0 +1,62 @@
+"""A pytest plug-in for tests of scenarios and faults; docs/FAULTS.md has a guide.
+
+pytest loads it in every environment in which laneweave is installed.
+"""
+
+from __future__ import annotations
+
+from itertools import count
+from pathlib import Path
+from typing import Any, Protocol
+
+import pytest
+
+from laneweave.launch.faults.fault_file import FaultSource
+from laneweave.launch.library.runs import SIMULATED, RunFailedError, ScenarioSource, Transport, run
+from laneweave.protocol.summary import RunSummary
+
+
+class LaneweaveRun(Protocol):
+    """Runs a scenario; the test fails if the run does, or breaks a promise."""
+
+    def __call__(
+        self,
+        scenario: ScenarioSource = None,
+        *,
+        faults: FaultSource = None,
+        transport: Transport = SIMULATED,
+        **overrides: Any,  # noqa: ANN401 (any field of a scenario)
+    ) -> RunSummary:
+        """Return the summary of the run; `summary.folder` has its files.
+
+        Args:
+            scenario: as in `laneweave.run`.
+            faults: as in `laneweave.run`.
+            transport: as in `laneweave.run`, but by default in virtual time.
+            **overrides: as in `laneweave.run`.
+
+        Raises:
+            BadInputError: an argument or a value of the scenario is invalid.
+        """
+
+
+@pytest.fixture
+def laneweave_run(tmp_path: Path) -> LaneweaveRun:
+    """Return a function that runs a scenario, with faults, in a folder of the test."""
+    numbers = count(1)
+
+    def run_scenario(
+        scenario: ScenarioSource = None,
+        *,
+        faults: FaultSource = None,
+        transport: Transport = SIMULATED,
+        **overrides: Any,  # noqa: ANN401 (any field of a scenario)
+    ) -> RunSummary:
+        out = tmp_path / f"run-{next(numbers)}"
+        try:
+            return run(scenario, out=out, transport=transport, faults=faults, **overrides)
+        except RunFailedError as error:
+            broken = "\n".join(error.problems)
+        pytest.fail(f"{broken}\nfiles of the run: {out}", pytrace=False)
+
+    return run_scenario
