@@ -7,13 +7,14 @@ from __future__ import annotations
 
 from itertools import count
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import pytest
 
-from laneweave.launch.faults.fault_file import FaultSource
-from laneweave.launch.library.runs import SIMULATED, RunFailedError, ScenarioSource, Transport, run
-from laneweave.protocol.summary import RunSummary
+if TYPE_CHECKING:
+    from laneweave.launch.faults.fault_file import FaultSource
+    from laneweave.launch.library.runs import ScenarioSource, Transport
+    from laneweave.protocol.summary import RunSummary
 
 
 class LaneweaveRun(Protocol):
@@ -24,7 +25,7 @@ class LaneweaveRun(Protocol):
         scenario: ScenarioSource = None,
         *,
         faults: FaultSource = None,
-        transport: Transport = SIMULATED,
+        transport: Transport = "simulated",
         **overrides: Any,  # noqa: ANN401 (any field of a scenario)
     ) -> RunSummary:
         """Return the summary of the run; `summary.folder` has its files.
@@ -43,13 +44,16 @@ class LaneweaveRun(Protocol):
 @pytest.fixture
 def laneweave_run(tmp_path: Path) -> LaneweaveRun:
     """Return a function that runs a scenario, with faults, in a folder of the test."""
+    # Other tests in an environment with laneweave need not wait for this.
+    from laneweave.launch.library.runs import RunFailedError, run
+
     numbers = count(1)
 
     def run_scenario(
         scenario: ScenarioSource = None,
         *,
         faults: FaultSource = None,
-        transport: Transport = SIMULATED,
+        transport: Transport = "simulated",
         **overrides: Any,  # noqa: ANN401 (any field of a scenario)
     ) -> RunSummary:
         out = tmp_path / f"run-{next(numbers)}"
