@@ -5,7 +5,7 @@ from __future__ import annotations
 from laneweave.protocol.config.participants import identities_of, max_vehicles
 from laneweave.protocol.config.rules import compare, require
 from laneweave.protocol.errors import BadInputError, raise_all
-from laneweave.protocol.field_validators import is_encrypted
+from laneweave.protocol.field_validators import host_of, is_encrypted
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.wire.identities import MAX_COMMON_NAME
 
@@ -65,6 +65,10 @@ def check_security(scenario: Scenario) -> None:
         require(secured or not is_encrypted(endpoint), "security.mode", "off", allowed)
     if not secured:
         return
+    # Zenoh 1.10 cannot connect to such an address, although it can listen there.
+    allowed = "a name or an IPv4 address with TLS and QUIC"
+    is_ipv6 = ":" in host_of(network.endpoint)
+    require(not is_ipv6, "network.endpoint", network.endpoint, allowed)
     require(bool(security.folder), "security.folder", "", "the folder of the certificates")
     count = max_vehicles(scenario)
     require(

@@ -85,6 +85,8 @@ MISFITS: list[tuple[str, dict[str, Any]]] = [
     ("demand.duration_s", MTLS | {"demand": {"duration_s": 80_000.0}}),
     ("security.clients", MTLS | {"security": {"mode": "mtls", "clients": ["x" * 58]}}),
     ("security.folder", MTLS | {"security": {"mode": "mtls", "folder": ""}}),
+    ("network.endpoint", MTLS | {"network": {"endpoint": "tls/[::1]:7447"}}),
+    ("network.endpoint", MTLS | {"network": {"endpoint": "quic/[2001:db8::1]:7447"}}),
     ("security.mode", {"security": {"mode": "tls"}}),
     ("security.fleets", {"security": {"fleets": {"a b": "0/1"}}}),
     ("security.fleets[a]", {"security": {"fleets": {"a": "1/1"}}}),

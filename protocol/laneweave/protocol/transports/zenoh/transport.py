@@ -379,7 +379,9 @@ def run_router(
             session = _open(router_settings(endpoints, lease_s, guard), ROUTER_RUNTIME)
         except zenoh.ZError as error:
             raise BadInputError(
-                field, ", ".join(endpoints), "endpoints that are not in use"
+                field,
+                ", ".join(endpoints),
+                "endpoints at addresses of this host that are not in use",
             ) from error
         try:
             observe(lambda: [RouterMetrics(len(session.info.transports()))])
