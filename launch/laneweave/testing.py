@@ -25,7 +25,8 @@ class LaneweaveRun(Protocol):
         scenario: ScenarioSource = None,
         *,
         faults: FaultSource = None,
-        transport: Transport = "simulated",
+        method: str = "formation",
+        transport: Transport | None = None,
         **overrides: Any,  # noqa: ANN401 (any field of a scenario)
     ) -> RunSummary:
         """Return the summary of the run; `summary.folder` has its files.
@@ -33,6 +34,7 @@ class LaneweaveRun(Protocol):
         Args:
             scenario: as in `laneweave.run`.
             faults: as in `laneweave.run`.
+            method: as in `laneweave.run`.
             transport: as in `laneweave.run`, but by default in virtual time.
             **overrides: as in `laneweave.run`.
 
@@ -53,12 +55,22 @@ def laneweave_run(tmp_path: Path) -> LaneweaveRun:
         scenario: ScenarioSource = None,
         *,
         faults: FaultSource = None,
-        transport: Transport = "simulated",
+        method: str = "formation",
+        transport: Transport | None = None,
         **overrides: Any,  # noqa: ANN401 (any field of a scenario)
     ) -> RunSummary:
         out = tmp_path / f"run-{next(numbers)}"
+        if transport is None and method == "formation":
+            transport = "simulated"
         try:
-            return run(scenario, out=out, transport=transport, faults=faults, **overrides)
+            return run(
+                scenario,
+                out=out,
+                method=method,
+                transport=transport,
+                faults=faults,
+                **overrides,
+            )
         except RunFailedError as error:
             broken = "\n".join(error.problems)
         pytest.fail(f"{broken}\nfiles of the run: {out}", pytrace=False)

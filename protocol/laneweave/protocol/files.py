@@ -12,10 +12,17 @@ def write_atomically(path: Path, write: str | Callable[[Path], object]) -> None:
     Args:
         path: the file.
         write: its text, or a function that writes its content to a given path.
+
+    Raises:
+        OSError: the disk is full, or fails; the file is as before.
     """
     part = path.with_suffix(".part")
-    if isinstance(write, str):
-        part.write_text(write, encoding="utf-8")
-    else:
-        write(part)
-    part.replace(path)
+    try:
+        if isinstance(write, str):
+            part.write_text(write, encoding="utf-8")
+        else:
+            write(part)
+        part.replace(path)
+    except OSError:
+        part.unlink(missing_ok=True)
+        raise

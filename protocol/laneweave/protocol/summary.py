@@ -23,6 +23,8 @@ IN_FILE = "in_file"
 """Metadata of a field: whether the file contains it; default True."""
 SUMMARY_FILE = "summary.json"
 SCHEMA = "laneweave.summary/1"
+INTERRUPTED, UNFINISHED = "interrupted", "unfinished"
+"""Values of `RunSummary.ending` for runs without an end of their own."""
 HARD_BRAKE_MPS2 = 5.0
 """Deceleration beyond which vehicles are counted as braking hard."""
 
@@ -304,9 +306,21 @@ def read_summary(folder: Path) -> RunSummary | None:
 
 
 def write_summary(folder: Path, summary: RunSummary) -> None:
-    """Write `summary.json` atomically."""
+    """Write `summary.json` atomically; on a full disk, in place of an earlier one of the run.
+
+    Raises:
+        OSError: there is no room for it.
+    """
     text = json.dumps(summary.to_json(), indent=2, allow_nan=False) + "\n"
-    write_atomically(folder / SUMMARY_FILE, text)
+    path = folder / SUMMARY_FILE
+    try:
+        write_atomically(path, text)
+    except OSError:
+        # An earlier one has room for about as much.
+        with path.open("rb+", buffering=0) as file:
+            if file.write(text.encode()) < len(text):
+                raise
+            file.truncate()
 
 
 def _is_written(one: attrs.Attribute[Any], value: object) -> bool:

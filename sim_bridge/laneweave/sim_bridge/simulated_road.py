@@ -47,7 +47,7 @@ class SimulatedRoad(Generic[VehicleT]):
         new_vehicle: Callable[[Admission, float, Scenario, int], VehicleT],
         incarnation: int = 0,
         *,
-        guards_cells: bool = True,
+        checks_occupancy: bool = True,
     ) -> None:
         """Begin with an empty road before the first tick.
 
@@ -58,8 +58,8 @@ class SimulatedRoad(Generic[VehicleT]):
             new_incarnation: returns an unused incarnation, for caretakers.
             new_vehicle: makes the vehicles; arguments as those of `RoadVehicle.entering`.
             incarnation: distinguishes this road from earlier roads of the same deployment.
-            guards_cells: whether motion controllers refuse moves into cells of other vehicles. The
-                fault search tests that plans never lead there.
+            checks_occupancy: whether motion controllers refuse moves into cells of other vehicles.
+                The fault search tests that plans never lead there.
         """
         self.scenario = scenario
         self.tick = 0
@@ -71,7 +71,7 @@ class SimulatedRoad(Generic[VehicleT]):
         self.bounds = scenario.runtime.bounds(incarnation)
         """Bounds of received numbers."""
         self._occupied_cells = (
-            OccupiedCells(self.vehicles, roadside.is_kept_free) if guards_cells else None
+            OccupiedCells(self.vehicles, roadside.is_kept_free) if checks_occupancy else None
         )
         self._roadside = roadside
         self._record = record

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -67,3 +69,19 @@ def test_every_field_is_described() -> None:
     for path, (unit, _) in found.items():
         expected = next((own for end, own in units.items() if path.endswith(f"_{end}")), unit)
         assert unit == expected, path
+
+
+def test_on_a_full_disk_a_summary_takes_the_place_of_an_earlier_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    write_summary(tmp_path, make_summary(seed=10_000))
+    monkeypatch.setattr("laneweave.protocol.summary.write_atomically", full)
+    write_summary(tmp_path, make_summary(seed=2))
+    summary = read_summary(tmp_path)
+    assert summary is not None
+    assert summary.seed == 2
+    with pytest.raises(OSError, match="No such file"):
+        write_summary(tmp_path / "gone", make_summary())

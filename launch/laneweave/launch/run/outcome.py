@@ -106,7 +106,10 @@ def complete_summary(
         faults=faults if faults is not None else summary.faults,
         plug_ins=_plug_ins(summary) or None,
     )
-    write_summary(folder, summary)
+    try:
+        write_summary(folder, summary)
+    except OSError as error:
+        problems = (*problems, f"the summary cannot be written: {error.strerror or error}")
     trips = folder / "trips.parquet"
     of_sumo = trips.is_file() and bool(scenario_of(trips).sumo.config)
     # A signal may arrive when the run is already complete.

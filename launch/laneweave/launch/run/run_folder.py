@@ -16,7 +16,14 @@ from attrs import evolve
 from laneweave.protocol.errors import BadInputError, RefusedError
 from laneweave.protocol.files import write_atomically
 from laneweave.protocol.scenario.fields import Scenario
-from laneweave.protocol.summary import SUMMARY_FILE, RunSummary, read_summary, write_summary
+from laneweave.protocol.summary import (
+    INTERRUPTED,
+    SUMMARY_FILE,
+    UNFINISHED,
+    RunSummary,
+    read_summary,
+    write_summary,
+)
 from laneweave.protocol.wire.events import ENTERED
 
 LOG_FILE = "log.jsonl"
@@ -28,8 +35,6 @@ EARLY_FILES = frozenset(
     (LOG_FILE, EVENTS_FILE, SUMMARY_FILE, "ticks.parquet", "trajectories.parquet", "trips.parquet")
 )
 """Files that an interrupted run may have before a vehicle enters."""
-INTERRUPTED, UNFINISHED = "interrupted", "unfinished"
-"""Values of `ending` in the summary."""
 FOLDER_RULE = "a new or empty folder"
 
 
@@ -146,14 +151,16 @@ def repair_run(folder: Path) -> RunSummary:
     if summary.ending != UNFINISHED:
         raise BadInputError("DIR", f"{folder} ({summary.ending})", "a run that was killed")
     try:
-        with (folder / LOG_FILE).open("ab") as log:
+        with (folder / LOG_FILE).open("rb+") as log:
             _lock(log.fileno(), fcntl.LOCK_EX)
+            events = folder / EVENTS_FILE
+            lines = events.read_bytes()
+            if not lines.endswith(b"\n"):
+                write_atomically(events, lines[: lines.rfind(b"\n") + 1].decode())
+            summary = evolve(summary, ending=INTERRUPTED)
+            write_summary(folder, summary)
     except BlockingIOError as error:
         raise BadInputError("DIR", f"{folder} (in use)", "a run that was killed") from error
-    events = folder / EVENTS_FILE
-    lines = events.read_bytes()
-    if not lines.endswith(b"\n"):
-        write_atomically(events, lines[: lines.rfind(b"\n") + 1].decode())
-    summary = evolve(summary, ending=INTERRUPTED)
-    write_summary(folder, summary)
+    except OSError as error:
+        raise BadInputError("DIR", f"{folder} ({error})", "a run that was killed") from error
     return summary

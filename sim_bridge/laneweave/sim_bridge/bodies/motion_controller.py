@@ -107,7 +107,7 @@ class MotionController:
     occupancy: Occupancy | None = None
     """Cells of other vehicles; None: not known."""
     refusal: Refusal | None = None
-    """The newest refusal; whoever reports it removes it."""
+    """The newest refusal that is not reported yet."""
     store: RecordStore = field(init=False)
     motion: CurrentMotion = field(init=False)
     command_tick: int = -1

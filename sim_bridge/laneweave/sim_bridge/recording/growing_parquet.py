@@ -1,8 +1,8 @@
 """Parquet files that are complete after every batch of rows, while they still grow.
 
 A Parquet file ends with a footer that lists its row groups. Each batch is written over the footer,
-together with a new one, in a single write. So a file can be read during the run, and a process that
-is killed loses only the rows that it has not written yet.
+together with a new one, in a single write. So a file can be read during the run, except while a
+batch is written, and a process that is killed loses only the rows that it has not written yet.
 
 Large row groups are small and fast to read. So that rows need not wait for one to fill up, they can
 be written as a provisional row group, over which the next batch is written.
@@ -10,6 +10,7 @@ be written as a provisional row group, over which the next batch is written.
 
 from __future__ import annotations
 
+import errno
 import io
 import os
 import tempfile
@@ -52,8 +53,8 @@ class GrowingParquet:
         self.schema = schema
         self._disk = disk or Disk()
         self._options = {"compression": "zstd", **options}
-        self._file = path.open("wb")
-        self._file.write(_MAGIC)
+        self._file = path.open("wb+", buffering=0)
+        write_whole(self._file, 0, _MAGIC)
         self._end = len(_MAGIC)
         """Position behind the last row group, where the footer begins."""
         _, self._metadata = self._row_group(pa.RecordBatch.from_pylist([], schema))
@@ -87,7 +88,9 @@ class GrowingParquet:
         # The metadata contain positions in the file, so write to a copy with a hole up to `_end`.
         # The copy has no name, so that a process that is killed leaves nothing behind.
         with tempfile.TemporaryFile() as copy:
-            copy.truncate(self._end + 2 * batch.nbytes + _MAX_OVERHEAD_BYTES)
+            # Reserved, as a mapping cannot report that the disk is full.
+            needed_bytes = 2 * batch.nbytes + _MAX_OVERHEAD_BYTES
+            os.posix_fallocate(copy.fileno(), self._end, needed_bytes)
             with pa.memory_map(f"/proc/self/fd/{copy.fileno()}", "r+") as sink:
                 with pq.ParquetWriter(
                     sink, self.schema, metadata_collector=metadata, **self._options
@@ -104,14 +107,29 @@ class GrowingParquet:
 
     def _write(self, rows: bytes, metadata: pq.FileMetaData) -> None:
         """Replace what follows the last row group by rows and a footer."""
-        data = rows + _footer(metadata)[len(_MAGIC) :]
-        self._file.flush()
-        # On a full disk, what was written stays readable.
-        os.posix_fallocate(self._file.fileno(), self._end, len(data))
-        self._file.seek(self._end)
-        self._file.write(data)
-        self._file.flush()
-        self._file.truncate(self._end + len(data))
+        write_whole(self._file, self._end, rows + _footer(metadata)[len(_MAGIC) :])
+
+
+def write_whole(file: io.FileIO, begin: int, data: bytes) -> None:
+    """Replace what a file has from a position on; after an error, it is as before.
+
+    Raises:
+        OSError: the disk is full, or fails.
+    """
+    file.seek(begin)
+    before = file.read()
+    file.seek(begin)
+    written_bytes, failed = 0, OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    try:
+        written_bytes = file.write(data)
+    except OSError as error:
+        failed = error
+    if written_bytes < len(data):
+        file.seek(begin)
+        file.write(before)  # its place is still reserved
+        file.truncate(begin + len(before))
+        raise failed
+    file.truncate(begin + len(data))
 
 
 def _footer(metadata: pq.FileMetaData) -> bytes:

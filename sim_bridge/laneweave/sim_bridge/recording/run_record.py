@@ -6,8 +6,7 @@
     events.jsonl           one JSON object per line, flushed line by line
 
 The Parquet files are written in row groups during the run, and can be read after each of them. So
-the record stores only what is on the road or not written yet, however long the run is. The summary
-is computed from the files when the run ends.
+the record stores little more than what is on the road or not written yet, however long the run is.
 
 Every `SAVE_EVERY_S`, all rows and a summary until then are saved, with the ending `unfinished`: a
 process that is killed loses no more. If the disk fails, recording stops, and the run goes on.
@@ -364,10 +363,10 @@ class RunRecord:
         """Save all rows, and a summary until road time `t_s`: the process may be killed."""
         for file in (self._trajectories, self._trips, self._ticks):
             file.save()
+        if self._disk.works:
+            self._recorded_s = t_s
         with self._disk.writing():
-            if self._disk.works:
-                self._write_summary(t_s, Ending.UNFINISHED)
-                self._recorded_s = t_s
+            self._write_summary(t_s, Ending.UNFINISHED)
 
     # --- the other roles ----------------------------------------------------------------------
 
@@ -411,7 +410,7 @@ class RunRecord:
             return
         self.event(t_s, RUN_ENDED, ending=ending.value)
         self._closed = True
-        with ExitStack() as closing:
+        with self._disk.writing(), ExitStack() as closing:
             for file in (self._events, self._trajectories, self._trips, self._ticks):
                 closing.callback(file.close)
         with self._disk.writing():

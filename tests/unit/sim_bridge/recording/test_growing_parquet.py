@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import io
 import signal
 import subprocess
 import sys
@@ -13,7 +15,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from laneweave.sim_bridge.recording.growing_parquet import GrowingParquet
+from laneweave.sim_bridge.recording.growing_parquet import GrowingParquet, write_whole
 
 COLUMNS: list[pa.Field[Any]] = [
     pa.field("t_s", pa.float64(), nullable=False),
@@ -138,3 +140,23 @@ def test_what_was_written_before_the_disk_was_full_can_be_read(tmp_path: Path) -
     ]
     assert ended.stdout.count("no longer recorded") + ended.stderr.count("no longer recorded") == 1
     assert pq.read_table(path)["number"].to_pylist() == [*range(10), *range(10)]
+
+
+class _ShortFile(io.FileIO):
+    """A file on a disk that has room for 12 bytes of it."""
+
+    def write(self, data: Any) -> int:  # noqa: ANN401 (as its base class)
+        return super().write(bytes(data)[: max(12 - self.tell(), 0)])
+
+
+@pytest.mark.parametrize("begin", [0, 4, 8])
+def test_a_write_without_room_leaves_a_file_as_it_was(tmp_path: Path, begin: int) -> None:
+    path = tmp_path / "file"
+    path.write_bytes(b"12345678")
+    with closing(_ShortFile(path, "rb+")) as file:
+        with pytest.raises(OSError, match="No space left") as failed:
+            write_whole(file, begin, b"x" * 100)
+        assert failed.value.errno == errno.ENOSPC
+        assert path.read_bytes() == b"12345678"
+        write_whole(file, begin, b"abc")
+    assert path.read_bytes() == b"12345678"[:begin] + b"abc"

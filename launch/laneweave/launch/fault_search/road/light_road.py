@@ -84,7 +84,7 @@ class LightRoad:
             new_incarnation,
             self._new_vehicle,
             bridge,
-            guards_cells=False,
+            checks_occupancy=False,
         )
         self.vehicles = self._road.vehicles
         self._scenario = scenario
