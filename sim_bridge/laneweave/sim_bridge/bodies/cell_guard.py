@@ -125,7 +125,7 @@ class CellGuard:
 
         A body that has entered ahead of its cell must not get farther ahead again.
         """
-        if self.moving_from is None and self.lead_m <= 0.0:
+        if self.moving_from is None and self.lead_m <= self._ahead_m:
             return
         s_m, _, _, y_m, _, _ = cell_state(self._lattice, hold_cell, t_s)
         ahead_m, across_m = measured[0] - s_m, measured[3] - y_m
