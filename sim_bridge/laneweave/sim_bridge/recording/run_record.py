@@ -70,8 +70,8 @@ from laneweave.sim_bridge.recording.trajectories import Sample, Trajectories
 from laneweave.sim_bridge.recording.trips import Trip, Trips, metadata_of, throughput, travel_time
 from laneweave.sim_bridge.road.demand import Arrival
 
-SAVE_EVERY_S = 8.0
-"""Wall time between two savings of a run that goes on."""
+FIRST_SAVE_S, SAVE_EVERY_S = 2.0, 8.0
+"""Wall time until a run is first saved, and between two savings while it goes on."""
 REPEAT_REFUSAL_S = 10.0
 """Shortest time between two events for refused commands of a vehicle, for one reason."""
 NONE_LEFT_OUT: Mapping[str, int] = MappingProxyType({})
@@ -175,8 +175,8 @@ class RunRecord:
         self._method = method
         self._stopwatch = stopwatch
         self._began = stopwatch()
-        self._saved_s = time.monotonic()
-        """Time at which everything was last saved."""
+        self._save_at_s = time.monotonic() + FIRST_SAVE_S
+        """Time at which everything is saved next."""
         self._disk = disk = Disk()
         metadata = metadata_of(scenario)
         try:
@@ -355,9 +355,9 @@ class RunRecord:
     def on_tick(self, t_s: float, on_road: int, duration_s: float) -> None:
         """Record the duration of a tick."""
         self._ticks.add(t_s, on_road, duration_s)
-        if time.monotonic() >= self._saved_s + SAVE_EVERY_S:
+        if time.monotonic() >= self._save_at_s:
             self.save(t_s)
-            self._saved_s = time.monotonic()
+            self._save_at_s = time.monotonic() + SAVE_EVERY_S
 
     def save(self, t_s: float) -> None:
         """Save all rows, and a summary until road time `t_s`: the process may be killed."""
