@@ -202,6 +202,11 @@ class Checker:
             self._ownership.move(t_s, vehicle, ballot)
             self._check_members(t_s, vehicle, ballot)
 
+    def undrivable(self, t_s: float, vehicle: str, move: tuple[Cell, Cell]) -> None:
+        """Report a move that the type of a vehicle does not drive."""
+        text = f"its type does not drive from {move[0]} to {move[1]}"
+        self._report("motion", t_s, [vehicle], text)
+
     def refused(self, t_s: float, vehicle: str, problem: str) -> None:
         """Report a command that a motion controller has refused as none of a correct agent."""
         self._report("refused", t_s, [vehicle], f"its command was refused: {problem}")

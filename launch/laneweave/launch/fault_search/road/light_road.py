@@ -242,6 +242,9 @@ class LightRoad:
         name, cell, in_charge = vehicle.name, vehicle.cell, vehicle.controller.record.incarnation
         move = (held, cell)
         self._checker.begin(now_s, name, in_charge, move, lasts_s, vehicle.latest_s)
+        along, across = cell[0] - held[0], cell[1] - held[1]
+        if (along, across) not in self._scenario.types[vehicle.arrival.vehicle_type].moves:
+            self._checker.undrivable(now_s, name, move)
         vehicle.body.go(cell, now_s - self.began_s, lasts_s)
 
     def _report_stored(self, now_s: float, vehicle: LightVehicle) -> None:
