@@ -1,8 +1,8 @@
 """Runs in which commands are forged, or agents are configured for another road.
 
-A forger knows every SENSE, and answers it in place of the agent, at times before it. It attacks a
-vehicle for some seconds in one of many ways (`Attack`), with the incarnation of the process in
-charge or a higher one.
+A forger receives every SENSE and answers it, too; its answer may arrive before that of the agent.
+It attacks a vehicle for some seconds in one of many ways (`Attack`), with the incarnation of the
+process in charge or a higher one.
 """
 
 from __future__ import annotations

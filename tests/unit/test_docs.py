@@ -38,10 +38,10 @@ from laneweave.protocol.config.scenario_files import load_scenario, parse_scenar
 from laneweave.protocol.lattice import Cell, footprint
 from laneweave.protocol.runtime.message_faults import MessageRule
 from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.summary import Ending
 from laneweave.protocol.vehicle.motion import cell_state
 from laneweave.protocol.wire.codec import KINDS
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import Bodies, pose_of
-from laneweave.sim_bridge.recording.run_record import Ending
 from scenario_reference import (
     MISSING,
     default_of,

@@ -10,11 +10,12 @@ from attrs import define
 
 from laneweave.protocol.road_layout import Exits, LaneSection
 from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.summary import Ending
 from laneweave.protocol.wire.events import PLANNING_FAILED
 from laneweave.protocol.wire.messages import ClosedFormation, Heartbeat, LogEvent, Name, Report
 from laneweave.sim_bridge.bodies.command_checks import Refusal
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import MinGaps
-from laneweave.sim_bridge.recording.run_record import Ending, RecordedVehicle
+from laneweave.sim_bridge.recording.run_record import RecordedVehicle
 from laneweave.sim_bridge.road.demand import Arrival
 
 

@@ -1,7 +1,10 @@
-"""Atomic writing of files."""
+"""Writing files: atomically, or in place such that an error changes nothing."""
 
 from __future__ import annotations
 
+import errno
+import io
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -26,3 +29,30 @@ def write_atomically(path: Path, write: str | Callable[[Path], object]) -> None:
     except OSError:
         part.unlink(missing_ok=True)
         raise
+
+
+def overwrite(file: io.FileIO, begin: int, data: bytes) -> None:
+    """Replace the content of a file from a position on; after an error, the file is as before.
+
+    Args:
+        file: opened unbuffered, for reading and writing.
+        begin: the position.
+        data: the new content.
+
+    Raises:
+        OSError: the disk is full, or fails.
+    """
+    file.seek(begin)
+    before = file.read()
+    file.seek(begin)
+    written_bytes, failed = 0, OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    try:
+        written_bytes = file.write(data)
+    except OSError as error:
+        failed = error
+    if written_bytes < len(data):
+        file.seek(begin)
+        file.write(before)  # the disk still has its blocks
+        file.truncate(begin + len(before))
+        raise failed
+    file.truncate(begin + len(data))

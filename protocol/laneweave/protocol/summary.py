@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from enum import Enum
 from pathlib import Path
 from typing import Any, get_args
 
@@ -17,14 +18,12 @@ from attrs import field, frozen
 from cattrs import Converter
 
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.files import write_atomically
+from laneweave.protocol.files import overwrite, write_atomically
 
 IN_FILE = "in_file"
 """Metadata of a field: whether the file contains it; default True."""
 SUMMARY_FILE = "summary.json"
 SCHEMA = "laneweave.summary/1"
-INTERRUPTED, UNFINISHED = "interrupted", "unfinished"
-"""Values of `RunSummary.ending` for runs without an end of their own."""
 HARD_BRAKE_MPS2 = 5.0
 """Deceleration beyond which vehicles are counted as braking hard."""
 
@@ -40,6 +39,19 @@ def figure(meaning: str, unit: str = "", default: object = attrs.NOTHING) -> Any
 def optional(meaning: str, unit: str = "") -> Any:  # noqa: ANN401 (as `attrs.field`)
     """Return a `figure` that not every summary has."""
     return figure(meaning, unit, default=None)
+
+
+class Ending(Enum):
+    """Reason why a run ended: the values of `RunSummary.ending`."""
+
+    COMPLETE = "complete"
+    """All demanded vehicles have left."""
+    INTERRUPTED = "interrupted"
+    """The run was stopped, or something failed."""
+    LIMIT = "limit"
+    """`max_road_s` was reached."""
+    UNFINISHED = "unfinished"
+    """The run goes on, or its process was killed."""
 
 
 @frozen(kw_only=True)
@@ -316,11 +328,9 @@ def write_summary(folder: Path, summary: RunSummary) -> None:
     try:
         write_atomically(path, text)
     except OSError:
-        # An earlier one has room for about as much.
+        # The blocks of an earlier summary are usually enough for this one.
         with path.open("rb+", buffering=0) as file:
-            if file.write(text.encode()) < len(text):
-                raise
-            file.truncate()
+            overwrite(file, 0, text.encode())
 
 
 def _is_written(one: attrs.Attribute[Any], value: object) -> bool:

@@ -35,6 +35,7 @@ from laneweave.protocol.runtime.node import (
 )
 from laneweave.protocol.scenario.deployment_fields import Runtime
 from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.summary import Ending
 from laneweave.protocol.wire.events import AGENT_MISSING
 from laneweave.protocol.wire.messages import (
     Command,
@@ -52,7 +53,6 @@ from laneweave.protocol.wire.topics import (
     VEHICLE_ALIVE,
 )
 from laneweave.sim_bridge.recording.record_interface import Record
-from laneweave.sim_bridge.recording.run_record import Ending
 from laneweave.sim_bridge.road.caretakers import notify_left
 from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.road.demand_queue import NO_OUTSIDE_TRAFFIC, OutsideTraffic

@@ -11,10 +11,11 @@ from laneweave.protocol.runtime.metrics import Observe, unobserved
 from laneweave.protocol.runtime.processes import interrupts_deferred
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.security.access_control import access_of
+from laneweave.protocol.summary import Ending
 from laneweave.protocol.transports.zenoh.runner import run_core
 from laneweave.protocol.wire.identities import Incarnations
 from laneweave.sim_bridge.core import BridgeCore
-from laneweave.sim_bridge.recording.run_record import Ending, RunRecord
+from laneweave.sim_bridge.recording.run_record import RunRecord
 from laneweave.sim_bridge.road_sources import demand_of, open_road
 
 

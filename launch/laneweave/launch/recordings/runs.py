@@ -16,7 +16,7 @@ from laneweave.protocol.config.scenario_files import parse_scenario, to_tables
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.operations import DEFAULT_OPERATION
-from laneweave.protocol.summary import SUMMARY_FILE, UNFINISHED, RunSummary, read_summary
+from laneweave.protocol.summary import SUMMARY_FILE, Ending, RunSummary, read_summary
 from laneweave.sim_bridge.recording.columns import SCENARIO_KEY
 
 SWEEP_FILE, POINT_FILE = "sweep.json", "point.json"
@@ -167,7 +167,7 @@ def single_run(folder: Path) -> Run:
         raise not_a_run(folder, "its summary.json is missing or incomplete")
     point = folder / POINT_FILE
     label = _read_point(point).label if point.is_file() else summary.method
-    if summary.ending == UNFINISHED:
+    if summary.ending == Ending.UNFINISHED.value:
         label += " (unfinished)"
     return Run(folder, label, summary.method, scenario, summary)
 

@@ -13,7 +13,7 @@ from laneweave.launch.run_methods import FORMATION
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.operations import ROLLING_SOLVER
 from laneweave.protocol.scenario.timing import COMFORT_MPS2
-from laneweave.protocol.summary import HARD_BRAKE_MPS2, UNFINISHED, Planning, RunSummary, Safety
+from laneweave.protocol.summary import HARD_BRAKE_MPS2, Ending, Planning, RunSummary, Safety
 
 Row = tuple[str, str]
 """Name of a figure, and its value with unit."""
@@ -50,9 +50,9 @@ def _traffic_rows(summary: RunSummary, *, preferences: bool) -> Iterator[Row]:
     yield "vehicles entered", f"{vehicles.entered}"
     yield "vehicles left", f"{vehicles.left}"
     outside = vehicles.demanded - vehicles.entered
-    if summary.ending == UNFINISHED:
+    if summary.ending == Ending.UNFINISHED.value:
         yield "unfinished: recorded until", f"{summary.simulated_s:.1f} s"
-    if outside and summary.ending == "complete":
+    if outside and summary.ending == Ending.COMPLETE.value:
         yield "never entered: did not come to the corridor, or exit full", f"{outside}"
     for reason, count in sorted((vehicles.left_out or {}).items()):
         yield f"left out: vehicles that {reason}", f"{count}"

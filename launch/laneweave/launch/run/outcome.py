@@ -17,7 +17,7 @@ from laneweave.launch.faults.failover import Failover
 from laneweave.launch.recordings.runs import scenario_of
 from laneweave.launch.report.summary_table import summary_rows
 from laneweave.launch.run_methods import FORMATION, REFERENCE_METHODS
-from laneweave.protocol.summary import RunSummary, read_summary, write_summary
+from laneweave.protocol.summary import Ending, RunSummary, read_summary, write_summary
 
 
 @frozen
@@ -113,7 +113,7 @@ def complete_summary(
     trips = folder / "trips.parquet"
     of_sumo = trips.is_file() and bool(scenario_of(trips).sumo.config)
     # A signal may arrive when the run is already complete.
-    interrupted = interrupted and summary.ending == "interrupted"
+    interrupted = interrupted and summary.ending == Ending.INTERRUPTED.value
     violations = _violations(summary, interrupted=interrupted, of_sumo=of_sumo)
     return Outcome(folder, summary, (*problems, *violations), interrupted)
 
@@ -143,7 +143,7 @@ def _violations(summary: RunSummary, *, interrupted: bool, of_sumo: bool) -> lis
         found.append(f"the run is recorded until {summary.recorded_until_s:g} s: the disk failed")
     if interrupted:
         return found
-    complete = summary.ending == "complete"
+    complete = summary.ending == Ending.COMPLETE.value
     if not complete:
         found.append(f"the run is not complete: {summary.ending}")
     expected = vehicles.entered if complete and of_sumo else vehicles.demanded

@@ -15,8 +15,9 @@ from laneweave.launch.run_methods import reference_method
 from laneweave.protocol.runtime.processes import stop_signals
 from laneweave.protocol.runtime.temporary_folders import temporary_folder
 from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.summary import Ending
 from laneweave.sim_bridge.baselines.reference_road import ReferenceRoad, ReferenceVehicle
-from laneweave.sim_bridge.recording.run_record import Ending, RunRecord
+from laneweave.sim_bridge.recording.run_record import RunRecord
 from laneweave.sim_bridge.road_sources import demand_of
 
 PROGRESS_EVERY_TICKS = 50

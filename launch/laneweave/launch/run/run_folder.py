@@ -17,9 +17,8 @@ from laneweave.protocol.errors import BadInputError, RefusedError
 from laneweave.protocol.files import write_atomically
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.summary import (
-    INTERRUPTED,
     SUMMARY_FILE,
-    UNFINISHED,
+    Ending,
     RunSummary,
     read_summary,
     write_summary,
@@ -134,7 +133,10 @@ def _is_unused(folder: Path) -> bool:
     if not (folder / SUMMARY_FILE).exists():
         return True
     summary = read_summary(folder)
-    return summary is not None and summary.ending in (INTERRUPTED, UNFINISHED)
+    return summary is not None and summary.ending in (
+        Ending.INTERRUPTED.value,
+        Ending.UNFINISHED.value,
+    )
 
 
 def repair_run(folder: Path) -> RunSummary:
@@ -148,7 +150,7 @@ def repair_run(folder: Path) -> RunSummary:
     if summary is None:
         allowed = "the folder of a run that was killed after its first seconds"
         raise BadInputError("DIR", str(folder), allowed)
-    if summary.ending != UNFINISHED:
+    if summary.ending != Ending.UNFINISHED.value:
         raise BadInputError("DIR", f"{folder} ({summary.ending})", "a run that was killed")
     try:
         with (folder / LOG_FILE).open("rb+") as log:
@@ -157,7 +159,7 @@ def repair_run(folder: Path) -> RunSummary:
             lines = events.read_bytes()
             if not lines.endswith(b"\n"):
                 write_atomically(events, lines[: lines.rfind(b"\n") + 1].decode())
-            summary = evolve(summary, ending=INTERRUPTED)
+            summary = evolve(summary, ending=Ending.INTERRUPTED.value)
             write_summary(folder, summary)
     except BlockingIOError as error:
         raise BadInputError("DIR", f"{folder} (in use)", "a run that was killed") from error

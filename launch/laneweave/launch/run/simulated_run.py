@@ -26,11 +26,12 @@ from laneweave.protocol.runtime.message_faults import FaultyCore
 from laneweave.protocol.runtime.node import Arrived, Core, Effect, Event, Listen, Started
 from laneweave.protocol.runtime.processes import stop_signals
 from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.summary import Ending
 from laneweave.protocol.transports.simulated.network import SimulatedNetwork
 from laneweave.protocol.transports.simulated.virtual_time import Conditions
 from laneweave.protocol.wire.messages import Census, Name
 from laneweave.sim_bridge.core import BridgeCore, TickPhase
-from laneweave.sim_bridge.recording.run_record import Ending, RunRecord
+from laneweave.sim_bridge.recording.run_record import RunRecord
 from laneweave.sim_bridge.road_sources import RunDemand, demand_of, open_road
 
 STALL_S = 600.0

@@ -114,11 +114,17 @@ def cell_state(lattice: Lattice, cell: Cell, t_s: float) -> State:
     return (lattice.cell_s_m(column, t_s), lattice.speed_mps, 0.0, lattice.cell_y_m(lane), 0.0, 0.0)
 
 
-def at_rest_in_cell(measured: State, lattice: Lattice, cell: Cell, t_s: float) -> bool:
-    """Return whether a body has arrived in `cell` at road time `t_s` [s]."""
+def at_rest_in_cell(
+    measured: State, lattice: Lattice, cell: Cell, t_s: float, room_ahead_m: float = 0.0
+) -> bool:
+    """Return whether a body has arrived in `cell` at road time `t_s` [s].
+
+    It may be as far ahead of its cell as behind it, and `room_ahead_m` if that is farther.
+    """
     goal = cell_state(lattice, cell, t_s)
-    along_m, across_m = abs(measured[0] - goal[0]), abs(measured[3] - goal[3])
-    return along_m <= ARRIVED_ALONG_M and across_m <= ARRIVED_ACROSS_M
+    ahead_m, across_m = measured[0] - goal[0], abs(measured[3] - goal[3])
+    in_column = -ARRIVED_ALONG_M <= ahead_m <= max(ARRIVED_ALONG_M, room_ahead_m)
+    return in_column and across_m <= ARRIVED_ACROSS_M
 
 
 def has_settled(measured: State, lattice: Lattice, cell: Cell, t_s: float) -> bool:

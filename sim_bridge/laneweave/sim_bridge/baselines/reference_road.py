@@ -11,11 +11,12 @@ from attrs import define
 
 from laneweave.protocol.road_layout import Exits
 from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.summary import Ending
 from laneweave.protocol.vehicle.motion import State
 from laneweave.protocol.wire.messages import RoadClock
 from laneweave.sim_bridge.bodies.motion_controller import FallbackLevel
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import Pose
-from laneweave.sim_bridge.recording.run_record import Ending, RunRecord
+from laneweave.sim_bridge.recording.run_record import RunRecord
 from laneweave.sim_bridge.road.demand import Arrival, count_until
 from laneweave.sim_bridge.road.entry import TIME_TOLERANCE_S
 from laneweave.sim_bridge.road.sized_bodies import bodies_of

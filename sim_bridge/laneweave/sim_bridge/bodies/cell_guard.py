@@ -23,21 +23,20 @@ from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.vehicle_tables import Vehicle
 from laneweave.protocol.vehicle.motion import (
     ARRIVED_ACROSS_M,
-    ARRIVED_ALONG_M,
     DISPLACED_ALONG_M,
     Jerk,
     State,
-    cell_state,
+    at_rest_in_cell,
     integrate,
     limited_jerk,
 )
 
 LEAD_TOLERANCE_M = 0.5
-"""How much farther ahead a body that falls back to its cell may get again."""
+"""Tolerance for a body that falls back to its cell and gets ahead again."""
 _SLACK_M = 1e-3
-"""Growth of an excess in a tick that counts as none."""
+"""Growth of an excess in a tick that is tolerated."""
 _SLOW_MPS = 1.0
-"""Speed up to which a body turns as at this speed."""
+"""Minimum speed in the computation of a body's heading."""
 
 
 def stopping_distance_m(speed: float, accel: float, max_jerk: float, max_accel: float) -> float:
@@ -95,12 +94,10 @@ class CellGuard:
     moving_from: Cell | None = None
     """Cell in which the move in progress began; None: the body has come to rest in its cell."""
     lead_m: float = math.inf
-    """How far the body may be ahead of its cell, because it has entered so. It only shrinks."""
+    """Allowed distance ahead of its cell, for a body that entered there; it only decreases."""
     _lattice: Lattice = field(init=False)
     _tick_s: float = field(init=False)
     _ahead_m: float = field(init=False)
-    _rests_m: float = field(init=False)
-    """How far ahead of its cell a body may be that rests in it."""
     _half_m: float = field(init=False)
     _across_m: float = field(init=False)
     _along: tuple[float, float] = field(init=False)
@@ -113,7 +110,6 @@ class CellGuard:
         scenario, limits = self._scenario, self._limits
         self._lattice, self._tick_s = scenario.lattice, scenario.runtime.tick_s
         self._ahead_m = max(DISPLACED_ALONG_M, scenario.types.room_ahead_m)
-        self._rests_m = max(ARRIVED_ALONG_M, scenario.types.room_ahead_m)
         self._half_m = 0.5 * limits.length_m
         widths_m = 0.5 * (limits.width_m + scenario.types.widest_body_m)
         self._across_m = min(ARRIVED_ACROSS_M, 0.5 * (self._lattice.lane_width_m - widths_m))
@@ -127,10 +123,10 @@ class CellGuard:
         """
         if self.moving_from is None and self.lead_m <= self._ahead_m:
             return
-        s_m, _, _, y_m, _, _ = cell_state(self._lattice, hold_cell, t_s)
-        ahead_m, across_m = measured[0] - s_m, measured[3] - y_m
+        ahead_m = measured[0] - self._lattice.cell_s_m(hold_cell[0], t_s)
         self.lead_m = min(self.lead_m, max(ahead_m, 0.0) + LEAD_TOLERANCE_M)
-        if -ARRIVED_ALONG_M <= ahead_m <= self._rests_m and abs(across_m) <= ARRIVED_ACROSS_M:
+        room_ahead_m = self._scenario.types.room_ahead_m
+        if at_rest_in_cell(measured, self._lattice, hold_cell, t_s, room_ahead_m):
             self.moving_from = None
 
     def region(self, hold_cell: Cell) -> frozenset[Cell]:
@@ -152,7 +148,7 @@ class CellGuard:
     def excess_m(self, commanded: State, jerk: Jerk, cells: tuple[Cell, Cell], t_s: float) -> float:
         """Return how far a jerk leads a body out of its cells; at most zero: it does not.
 
-        It may lead a body that is out of its cells anywhere but farther out.
+        For a body that is outside already, only the growth of its excess counts.
 
         Args:
             commanded: commanded state in road coordinates.
@@ -160,43 +156,43 @@ class CellGuard:
             cells: see the class.
             t_s: road time at the beginning of the tick.
         """
-        # What exceeds the vehicle's limits is executed only in part, and harmless if it would be
-        # as a whole: the limited jerk is between this one and the hardest stop.
-        after = self._excess(integrate(commanded, jerk, self._tick_s), cells, t_s + self._tick_s)
-        worst_m = max(after)
-        if worst_m <= 0.0:
-            return worst_m
-        return max(self._growth(commanded, jerk, cells, t_s))
+        return max(self._excess_after(commanded, jerk, cells, t_s))
 
     def keep_in_cells(
         self, commanded: State, jerk: Jerk, cells: tuple[Cell, Cell], t_s: float
     ) -> Jerk:
         """Return a jerk, or one that stops the body where this one leads out of its cells."""
-        growth = self._growth(commanded, jerk, cells, t_s)
-        if max(growth) <= 0.0:
+        excess = self._excess_after(commanded, jerk, cells, t_s)
+        if max(excess) <= 0.0:
             return jerk
         (along, across), tick_s = jerk, self._tick_s
         _, v, a, _, v_y, a_y = commanded
-        if growth.ahead_m > 0.0:
+        if excess.ahead_m > 0.0:
             along = stopping_jerk(v - self._lattice.speed_mps, a, *self._along, tick_s)
-        if growth.left_m > 0.0:
+        if excess.left_m > 0.0:
             across = stopping_jerk(v_y, a_y, *self._across, tick_s)
-        elif growth.right_m > 0.0:
+        elif excess.right_m > 0.0:
             across = -stopping_jerk(-v_y, -a_y, *self._across, tick_s)
         return along, across
 
-    def _growth(
+    def _excess_after(
         self, commanded: State, jerk: Jerk, cells: tuple[Cell, Cell], t_s: float
     ) -> _Excess:
-        """Return by how much an excess grows in a tick of a jerk, within the vehicle's limits."""
+        """Return the excess after a tick of a jerk; if the body is outside, what it grows by."""
+        then_s = t_s + self._tick_s
+        # The plant clips a jerk beyond the vehicle's limits. The clipped jerk is between this one
+        # and the hardest stop: if this one keeps the body inside, so does that one.
+        after = self._excess(integrate(commanded, jerk, self._tick_s), cells, then_s)
+        if max(after) <= 0.0:
+            return after
         limited = limited_jerk(commanded, jerk, self._limits, self._tick_s)
         next_state = integrate(commanded, limited, self._tick_s)
         now = self._excess(commanded, cells, t_s, turns=False)
-        # A body that is out of its lane must turn to get back.
+        # A body outside its lane has to turn to get back, so only its centre counts.
         turns = max(now.left_m, now.right_m) <= 0.0
         if turns:
             now = self._excess(commanded, cells, t_s)
-        after = self._excess(next_state, cells, t_s + self._tick_s, turns=turns)
+        after = self._excess(next_state, cells, then_s, turns=turns)
         return _Excess(
             *(then - max(was, 0.0) - _SLACK_M for then, was in zip(after, now, strict=True))
         )

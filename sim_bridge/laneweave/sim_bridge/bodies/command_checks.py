@@ -35,7 +35,6 @@ ERRORS_M = 1.0
 CATCHING_UP_MPS = 1.0
 """Speed above v_F from which a body that keeps its column catches up with its cell."""
 
-
 Sides = tuple[Sequence[Neighbour], Sequence[Neighbour]]
 """Neighbours ahead and behind."""
 
@@ -58,7 +57,7 @@ class Problem(Enum):
 
 @frozen
 class Refusal:
-    """A command that has been refused, as no correct agent sends it."""
+    """Why a motion controller has refused a command that no correct agent sends."""
 
     problem: Problem
     excess_m: float = 0.0
@@ -131,8 +130,10 @@ class Occupancy(Protocol):
         """
 
 
-def decoded_jerks(command: Command, lattice: Lattice) -> array[float]:
-    """Return the jerks of a command: pairs (along, across) for successive ticks [m/s3].
+def checked_jerks(command: Command, lattice: Lattice) -> array[float]:
+    """Return the jerks of a command whose numbers are all in range.
+
+    They are pairs (along, across) for successive ticks [m/s3].
 
     Raises:
         BadInputError: they are not pairs of finite numbers, a cell is not in a lane, or a number

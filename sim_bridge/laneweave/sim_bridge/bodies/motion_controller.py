@@ -63,7 +63,7 @@ from laneweave.sim_bridge.bodies.command_checks import (
     Occupancy,
     Problem,
     Refusal,
-    decoded_jerks,
+    checked_jerks,
 )
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import NO_NEIGHBOURS, Neighbours
 from laneweave.sim_bridge.bodies.plant import Plant
@@ -295,7 +295,7 @@ class MotionController:
         if incarnation < in_charge or command.tick <= self.command_tick:
             return False
         try:
-            jerks = decoded_jerks(command, self.lattice)
+            jerks = checked_jerks(command, self.lattice)
         except BadInputError:
             self.refusal = Refusal(Problem.VALUES)
             raise
@@ -334,7 +334,7 @@ class MotionController:
         return True
 
     def _refusal_of_move(self, command: Command) -> Refusal | None:
-        """Return what is wrong with a command for another cell, apart from the situation."""
+        """Return why no correct agent sends a command for another cell; None: one may send it."""
         origin, target = self.hold_cell, command.hold_cell
         if self._guard.moving_from is not None or command.motion.origin != origin:
             return Refusal(Problem.MOVE)
@@ -387,13 +387,11 @@ class MotionController:
         near: Sequence[Neighbour] = self.neighbours.ahead
         if near:
             near = self._relevant(near, measured[3])
+        stays = self._must_stay_in_lane(tick)
         if self._lane_ends:
-            enters, t_s = not self._must_stay_in_lane(tick), tick * self.tick_s
-            lines = self._stop_lines.lines(measured, self.hold_cell, t_s, enters=enters)
-            near = [*near, *lines]
-        level, jerk = self._next(tick, near)
-        if self.off_lattice is None:
-            level, jerk = self._within_cells(tick, near, level, jerk)
+            t_s, seen = tick * self.tick_s, self._stop_lines
+            near = [*near, *seen.lines(measured, self.hold_cell, t_s, enters=not stays)]
+        level, jerk = self._next(tick, near, stays=stays)
         if near and self._must_brake(measured, jerk, near):
             level = FallbackLevel.EMERGENCY
             # The body leaves its trajectory.
@@ -405,39 +403,40 @@ class MotionController:
         self.level_ticks[level] += 1
         self._measured = None
 
-    def _within_cells(
-        self, tick: int, near: Sequence[Neighbour], level: FallbackLevel, jerk: Jerk
+    def _next(
+        self, tick: int, near: Sequence[Neighbour], *, stays: bool
     ) -> tuple[FallbackLevel, Jerk]:
-        """Return level and jerk for a tick, within the cells of the vehicle (`cell_guard`)."""
+        """Return the level and jerk for a tick without an emergency.
+
+        `near`: neighbours and stop lines ahead; `stays`: `_must_stay_in_lane` in this tick.
+        """
         t_s, guard = tick * self.tick_s, self._guard
-        cells = guard.cells(self.measured, self.hold_cell)
         commanded = commanded_state(
             self.measured, self.plant.setpoint, self._limits, self.lattice.speed_mps
         )
-        excess_m = guard.excess_m(commanded, jerk, cells, t_s)
-        if excess_m <= 0.0:
-            return level, jerk
-        if level is FallbackLevel.EXECUTE:
+        cells = guard.cells(self.measured, self.hold_cell)
+        index = 2 * (tick - self._jerks_tick)
+        if 0 <= index < len(self._jerks) and not stays:
+            jerk = self._jerks[index], self._jerks[index + 1]
+            excess_m = guard.excess_m(commanded, jerk, cells, t_s)
+            if excess_m <= 0.0:
+                return FallbackLevel.EXECUTE, jerk
             self.refusal = Refusal(Problem.LEAVES_CELLS, excess_m)
             self._jerks = self._jerks[:0]
-            level, jerk = self._hold(tick, near)
-        return level, guard.keep_in_cells(commanded, jerk, cells, t_s)
+        level, jerk = self._hold(tick, near, commanded, stays=stays)
+        if self.off_lattice is None:
+            jerk = guard.keep_in_cells(commanded, jerk, cells, t_s)
+        return level, jerk
 
-    def _next(self, tick: int, near: Iterable[Neighbour]) -> tuple[FallbackLevel, Jerk]:
-        """Return the level and jerk for a tick without an emergency."""
-        index = 2 * (tick - self._jerks_tick)
-        if 0 <= index < len(self._jerks) and not self._must_stay_in_lane(tick):
-            return FallbackLevel.EXECUTE, (self._jerks[index], self._jerks[index + 1])
-        return self._hold(tick, near)
-
-    def _hold(self, tick: int, near: Iterable[Neighbour]) -> tuple[FallbackLevel, Jerk]:
-        """Return the level and jerk with which the vehicle drives into its cell, and stays."""
-        limits, speed_mps, body = self._limits, self.lattice.speed_mps, self.measured
-        state = commanded_state(body, self.plant.setpoint, limits, speed_mps)
+    def _hold(
+        self, tick: int, near: Iterable[Neighbour], state: State, *, stays: bool
+    ) -> tuple[FallbackLevel, Jerk]:
+        """Return level and jerk for driving from a commanded state into the cell; see `_next`."""
+        limits, body = self._limits, self.measured
         goal = cell_state(self.lattice, self.hold_cell, tick * self.tick_s)
         if self.off_lattice is OffLatticePhase.WAITING:
             goal = (state[0], *goal[1:])  # at v_F in its lane, up to the line
-        elif self._must_stay_in_lane(tick):
+        elif stays:
             goal = (*goal[:3], self.lattice.cell_y_m(self._body_lane), 0.0, 0.0)
         jerk = hold_law(state, goal, limits, self.tick_s)
         lag_s, goal_lane = limits.actuator_lag_s, self.hold_cell[1]

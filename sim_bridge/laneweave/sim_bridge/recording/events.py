@@ -11,16 +11,16 @@ from pathlib import Path
 
 import numpy as np
 
+from laneweave.protocol.files import overwrite
 from laneweave.protocol.scenario.formation_table import SOLVERS, solver_of_event
 from laneweave.protocol.summary import Planning, PlanningMs
 from laneweave.protocol.wire.events import PLAN_EVENTS
 from laneweave.sim_bridge.recording.disk import Disk
-from laneweave.sim_bridge.recording.growing_parquet import write_whole
 from laneweave.sim_bridge.recording.statistics import percentiles_of
 
 
 class Events:
-    """Writer of events, each of which is in the file at once; counts the plans among them."""
+    """Writer of events, each of which it writes at once; counts the plans among them."""
 
     def __init__(self, path: Path, disk: Disk | None = None) -> None:
         """Open the file."""
@@ -44,7 +44,7 @@ class Events:
         line = json.dumps({**own, **data, **own}, default=str) + "\n"
         if self._disk.works:
             with self._disk.writing():
-                write_whole(self._file, self._file.tell(), line.encode())
+                overwrite(self._file, self._file.tell(), line.encode())
 
     def close(self) -> None:
         """Close the file. Idempotent."""

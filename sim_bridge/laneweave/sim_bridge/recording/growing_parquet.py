@@ -10,7 +10,6 @@ be written as a provisional row group, over which the next batch is written.
 
 from __future__ import annotations
 
-import errno
 import io
 import os
 import tempfile
@@ -20,6 +19,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from laneweave.protocol.files import overwrite
 from laneweave.sim_bridge.recording.disk import Disk
 
 _MAGIC = b"PAR1"
@@ -54,7 +54,7 @@ class GrowingParquet:
         self._disk = disk or Disk()
         self._options = {"compression": "zstd", **options}
         self._file = path.open("wb+", buffering=0)
-        write_whole(self._file, 0, _MAGIC)
+        overwrite(self._file, 0, _MAGIC)
         self._end = len(_MAGIC)
         """Position behind the last row group, where the footer begins."""
         _, self._metadata = self._row_group(pa.RecordBatch.from_pylist([], schema))
@@ -107,29 +107,7 @@ class GrowingParquet:
 
     def _write(self, rows: bytes, metadata: pq.FileMetaData) -> None:
         """Replace what follows the last row group by rows and a footer."""
-        write_whole(self._file, self._end, rows + _footer(metadata)[len(_MAGIC) :])
-
-
-def write_whole(file: io.FileIO, begin: int, data: bytes) -> None:
-    """Replace what a file has from a position on; after an error, it is as before.
-
-    Raises:
-        OSError: the disk is full, or fails.
-    """
-    file.seek(begin)
-    before = file.read()
-    file.seek(begin)
-    written_bytes, failed = 0, OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-    try:
-        written_bytes = file.write(data)
-    except OSError as error:
-        failed = error
-    if written_bytes < len(data):
-        file.seek(begin)
-        file.write(before)  # its place is still reserved
-        file.truncate(begin + len(before))
-        raise failed
-    file.truncate(begin + len(data))
+        overwrite(self._file, self._end, rows + _footer(metadata)[len(_MAGIC) :])
 
 
 def _footer(metadata: pq.FileMetaData) -> bytes:

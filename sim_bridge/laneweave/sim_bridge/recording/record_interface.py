@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import Protocol
 
+from laneweave.protocol.summary import Ending
 from laneweave.protocol.wire.messages import ClosedFormation, Heartbeat, LogEvent, Name, Report
 from laneweave.sim_bridge.bodies.command_checks import Refusal
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import MinGaps
-from laneweave.sim_bridge.recording.run_record import Ending, RecordedVehicle
+from laneweave.sim_bridge.recording.run_record import RecordedVehicle
 from laneweave.sim_bridge.road.demand import Arrival
 
 

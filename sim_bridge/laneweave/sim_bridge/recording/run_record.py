@@ -22,7 +22,6 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
-from enum import Enum
 from pathlib import Path
 from types import MappingProxyType
 from typing import Protocol
@@ -36,6 +35,7 @@ from laneweave.protocol.road_layout import END_OF_ROAD, Exits, LaneSection
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.summary import (
     SCHEMA,
+    Ending,
     LeaderChanges,
     Messages,
     RunSummary,
@@ -132,19 +132,6 @@ class _Counts:
     """Commands that motion controllers have refused."""
     stopped: set[Name] = field(factory=set)
     """Vehicles that have left the lattice at the end of a lane."""
-
-
-class Ending(Enum):
-    """Reason why a run ended."""
-
-    COMPLETE = "complete"
-    """All demanded vehicles have left."""
-    INTERRUPTED = "interrupted"
-    """The run was stopped, or something failed."""
-    LIMIT = "limit"
-    """`max_road_s` was reached."""
-    UNFINISHED = "unfinished"
-    """The run goes on, or its process was killed."""
 
 
 class RunRecord:

@@ -1,4 +1,4 @@
-"""Numbers of a summary: rounded values, and percentiles."""
+"""Rounding and percentiles of the numbers in summaries and benchmarks."""
 
 from __future__ import annotations
 

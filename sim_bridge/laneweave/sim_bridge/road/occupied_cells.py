@@ -23,7 +23,12 @@ class OccupiedCells:
     def __init__(
         self, vehicles: Mapping[Name, RoadVehicle], is_kept_free: Callable[[Cell], bool]
     ) -> None:
-        """Look at vehicles, which come and go; `is_kept_free`: whether a cell belongs to a gap."""
+        """Create the lookup.
+
+        Args:
+            vehicles: the vehicles on the road, which the owner of the mapping adds and removes.
+            is_kept_free: returns whether a cell belongs to a gap for re-entry.
+        """
         self._vehicles = vehicles
         self._is_kept_free = is_kept_free
 

@@ -18,6 +18,7 @@ from laneweave.launch.run.reference_run import ReferenceRun, Standstill
 from laneweave.launch.run_methods import LC2013, RULE, reference_method
 from laneweave.protocol.config.scenario_files import parse_scenario, to_tables
 from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.summary import Ending
 from laneweave.sim_bridge import road_sources
 from laneweave.sim_bridge.baselines import reference_road as road
 from laneweave.sim_bridge.baselines.reference_method import ReferenceMethod
@@ -25,7 +26,7 @@ from laneweave.sim_bridge.baselines.reference_road import ReferenceVehicle
 from laneweave.sim_bridge.baselines.rule_based import RuleMethod
 from laneweave.sim_bridge.baselines.rules import Rules
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import Bodies
-from laneweave.sim_bridge.recording.run_record import Ending, RunRecord
+from laneweave.sim_bridge.recording.run_record import RunRecord
 from laneweave.sim_bridge.road.demand import Arrival
 from support.bridge_bench import read_events, read_summary
 from support.commands import Here

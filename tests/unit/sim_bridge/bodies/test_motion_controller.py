@@ -56,7 +56,8 @@ def driven(controller: MotionController) -> dict[FallbackLevel, int]:
 
 def plays(controller: MotionController, tick: int) -> Jerk | None:
     """Return the jerk that it would play at a tick; None: it would play nothing."""
-    level, jerk = controller._next(tick, ())
+    stays = controller._must_stay_in_lane(tick)
+    level, jerk = controller._next(tick, (), stays=stays)
     return jerk if level is FallbackLevel.EXECUTE else None
 
 

@@ -15,7 +15,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from laneweave.sim_bridge.recording.growing_parquet import GrowingParquet, write_whole
+from laneweave.protocol.files import overwrite
+from laneweave.sim_bridge.recording.growing_parquet import GrowingParquet
 
 COLUMNS: list[pa.Field[Any]] = [
     pa.field("t_s", pa.float64(), nullable=False),
@@ -26,6 +27,7 @@ WRITE_AND_DIE = """
 import os, signal, sys
 from pathlib import Path
 import pyarrow as pa
+from laneweave.protocol.files import overwrite
 from laneweave.sim_bridge.recording.growing_parquet import GrowingParquet
 
 schema = pa.schema([pa.field("number", pa.int64())])
@@ -112,6 +114,7 @@ import resource, sys
 from pathlib import Path
 import pyarrow as pa
 from laneweave.sim_bridge.recording.disk import Disk
+from laneweave.protocol.files import overwrite
 from laneweave.sim_bridge.recording.growing_parquet import GrowingParquet
 
 schema = pa.schema([pa.field("number", pa.int64())])
@@ -143,7 +146,7 @@ def test_what_was_written_before_the_disk_was_full_can_be_read(tmp_path: Path) -
 
 
 class _ShortFile(io.FileIO):
-    """A file on a disk that has room for 12 bytes of it."""
+    """A file that cannot become longer than 12 bytes, as on a full disk."""
 
     def write(self, data: Any) -> int:  # noqa: ANN401 (as its base class)
         return super().write(bytes(data)[: max(12 - self.tell(), 0)])
@@ -155,8 +158,8 @@ def test_a_write_without_room_leaves_a_file_as_it_was(tmp_path: Path, begin: int
     path.write_bytes(b"12345678")
     with closing(_ShortFile(path, "rb+")) as file:
         with pytest.raises(OSError, match="No space left") as failed:
-            write_whole(file, begin, b"x" * 100)
+            overwrite(file, begin, b"x" * 100)
         assert failed.value.errno == errno.ENOSPC
         assert path.read_bytes() == b"12345678"
-        write_whole(file, begin, b"abc")
+        overwrite(file, begin, b"abc")
     assert path.read_bytes() == b"12345678"[:begin] + b"abc"

@@ -19,11 +19,12 @@ from structlog.testing import capture_logs
 from laneweave import load_run
 from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.summary import Ending
 from laneweave.protocol.wire.messages import Heartbeat, LogEvent, Name, Report
 from laneweave.sim_bridge.bodies.motion_controller import FallbackLevel
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import MinGaps
 from laneweave.sim_bridge.recording.columns import SCENARIO_KEY
-from laneweave.sim_bridge.recording.run_record import Ending, RunRecord
+from laneweave.sim_bridge.recording.run_record import RunRecord
 from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.road.entry import Admission
 from laneweave.sim_bridge.road.vehicle import RoadVehicle

@@ -208,7 +208,7 @@ class Checker:
         self._report("motion", t_s, [vehicle], text)
 
     def refused(self, t_s: float, vehicle: str, problem: str) -> None:
-        """Report a command that a motion controller has refused as none of a correct agent."""
+        """Report that a motion controller has refused a command (`command_checks.Problem`)."""
         self._report("refused", t_s, [vehicle], f"its command was refused: {problem}")
 
     def advance(self, t_s: float) -> None:

@@ -218,7 +218,7 @@ class LightRoad:
             self._checker.leave(self.began_s + t_s, vehicle.name)
 
     def on_refused(self, t_s: float, vehicle: Name, refusal: Refusal) -> None:
-        """Report a refused command: agents are correct here."""
+        """Report a refused command, which is a violation: all agents are correct here."""
         self._checker.refused(self.began_s + t_s, vehicle, refusal.problem.value)
 
     def on_lane_end(self, t_s: float, vehicle: Name, lane: int, kind: str) -> None:
