@@ -133,6 +133,7 @@ class NodeMetrics:
     published_total: int = metric("Messages published by this process")
     received_total: Mapping[str, int] = metric("Valid messages received", label="topic")
     rejected_total: int = metric("Invalid messages received")
+    skipped_fields_total: int = metric("Fields of a later release in messages received")
     events_total: int = metric("Events handled by the core: messages, tokens, timers, results")
     handling_seconds_total: float = metric("Time spent handling events")
 

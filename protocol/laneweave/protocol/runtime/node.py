@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Mapping
-from functools import lru_cache, partial
+from functools import partial
 from typing import Any, Protocol
 
 import structlog
@@ -31,7 +31,7 @@ from laneweave.protocol.runtime.transport import (
     TokenUp,
     Transport,
 )
-from laneweave.protocol.wire.codec import decode, encode
+from laneweave.protocol.wire.codec import decode, encode, remembering_decode
 from laneweave.protocol.wire.messages import Name, Report
 from laneweave.protocol.wire.topics import SERVICE, Keys, Topic, key_of
 
@@ -277,13 +277,6 @@ def core_metrics(core: Core) -> Iterable[MetricsSnapshot]:
     return metrics
 
 
-_REMEMBERED = 128
-"""Number of decoded messages that a node remembers: while messages are lost, SENSE and COMMAND are
-repeated, and decoding them takes longer than handling the repetition."""
-_REMEMBERED_BYTES = 2048
-"""Maximum size of a message that is remembered, so that no sender can fill the memory."""
-
-
 class Node:
     """Driver of one core over one transport."""
 
@@ -313,6 +306,8 @@ class Node:
         self.ended = False
         self.published = 0
         self.rejected = 0
+        self.skipped_fields = 0
+        """Number of fields in received messages that only a later release knows."""
         self.received: dict[str, int] = {}
         """Number of valid messages by topic name."""
         self.handled = 0
@@ -322,7 +317,7 @@ class Node:
         self._transport = transport
         self._keys = keys
         self._submit = submit
-        self._read = read or partial(read_message, keys, decode=_remembering_decode())
+        self._read = read or partial(read_message, keys, decode=remembering_decode(self._on_skipped))
         self._write = write
         self._encoded: tuple[object, bytes] = (None, b"")
         """Last encoded message and its bytes, reused because a plan goes to several vehicles."""
@@ -358,7 +353,12 @@ class Node:
     def metrics(self) -> list[MetricsSnapshot]:
         """Return the metrics of this node and its core."""
         own = NodeMetrics(
-            self.published, self.received.copy(), self.rejected, self.handled, self.handling_s
+            self.published,
+            self.received.copy(),
+            self.rejected,
+            self.skipped_fields,
+            self.handled,
+            self.handling_s,
         )
         return [own, *core_metrics(self.core)]
 
@@ -379,6 +379,11 @@ class Node:
         known = self._keys.read(query.sender)
         sender = {} if known is None else known[1]
         return QueryArrived(query.token, query.payload, query.encoding, topic, sender)
+
+    def _on_skipped(self, fields: int) -> None:
+        if not self.skipped_fields:
+            log.warning("messages of a later release have more fields, which are skipped")
+        self.skipped_fields += fields
 
     def _reject(self, key: str, error: BadInputError) -> None:
         self.rejected += 1
@@ -442,17 +447,6 @@ def read_message(
     if topic.kind is None:
         raise BadInputError("key", key, "a topic that carries messages")
     return Arrived(topic, parameters, decode(payload, topic.kind))
-
-
-def _remembering_decode() -> Callable[[bytes, type], object]:
-    """Return `decode` with a memory for small messages, which are immutable."""
-    remembered = lru_cache(_REMEMBERED)(decode)
-
-    def decode_or_recall(payload: bytes, kind: type) -> object:
-        small = len(payload) <= _REMEMBERED_BYTES
-        return remembered(payload, kind) if small else decode(payload, kind)
-
-    return decode_or_recall
 
 
 def _key_of(keys: Keys, event: Event) -> str:

@@ -2,12 +2,19 @@
 
 Decoding checks size, version, kind, number of fields, types, finiteness and ranges. Invalid bytes
 raise only `BadInputError`, which names the field.
+
+**Versions.** A release adds fields only at the end of a class and with defaults, so that processes
+of two releases understand each other: fields that an earlier release has not sent take their
+defaults, and fields of a later one are skipped and counted. Any other change raises `VERSION`, and
+processes refuse messages of another version. Named tuples never change.
 """
 
 from __future__ import annotations
 
 import math
 import re
+from collections.abc import Callable
+from functools import lru_cache
 from types import NoneType, UnionType
 from typing import Any, get_args, get_origin, get_type_hints
 
@@ -23,16 +30,23 @@ from laneweave.protocol.wire.messages import LogEvent
 from laneweave.protocol.wire.topics import TOPICS
 
 VERSION = 2
+"""Version of the messages."""
 MAX_BYTES = 1 << 20
 KINDS: dict[str, type[Message]] = {
     topic.kind.__name__: topic.kind for topic in TOPICS if topic.kind is not None
 }
+REMEMBERED = 128
+"""Number of decoded messages that a process remembers: while messages are lost, SENSE and COMMAND
+are repeated, and decoding them takes longer than handling the repetition."""
+REMEMBERED_BYTES = 2048
+"""Maximum size of a message that is remembered, so that no sender can fill the memory."""
 _ENCODER = Encoder()
 _ENVELOPE = Decoder(tuple[int, str, Raw])
 _DECODERS: dict[str, Decoder[Any]] = {name: Decoder(kind) for name, kind in KINDS.items()}
 _MAX_DEPTH = 8
 _MIN_INT, _MAX_INT = -(2**63), 2**63 - 1
 _PLACE = re.compile(r"Expected (?P<allowed>.*?)(?:, got .*?)?(?: - at (?P<path>.*))?", re.DOTALL)
+_LONGER = "Expected `array` of at most length"
 _LENGTH = re.compile(r"`array` of at least length \d+, got (\d+)")
 _IN_WORDS = {
     "`int`": "a 64-bit integer",
@@ -51,12 +65,17 @@ def encode(message: object) -> bytes:
     return _ENCODER.encode((VERSION, type(message).__name__, message))
 
 
-def decode(payload: bytes, expected: type | None = None) -> object:
+def decode(
+    payload: bytes,
+    expected: type | None = None,
+    on_skipped: Callable[[int], None] = lambda _: None,
+) -> object:
     """Return the message in `payload`.
 
     Args:
         payload: arbitrary bytes.
         expected: required message class; None: any.
+        on_skipped: called with the number of skipped fields if a later release has sent them.
 
     Raises:
         BadInputError: the payload is not one valid message of the expected class.
@@ -67,13 +86,56 @@ def decode(payload: bytes, expected: type | None = None) -> object:
         version, name, body = _ENVELOPE.decode(payload)
         kind = KINDS[name]
         if version == VERSION and (expected is None or kind is expected):
-            message = _DECODERS[name].decode(body)
+            try:
+                message = _DECODERS[name].decode(body)
+            except ValidationError as error:
+                if not str(error).startswith(_LONGER):
+                    raise
+                known, skipped = _known(msgpack.unpackb(body, strict_map_key=False), kind)
+                message = _DECODERS[name].decode(_ENCODER.encode(known))
+                on_skipped(skipped)
             if kind is not LogEvent or _is_plain(message.data, _MAX_DEPTH):
                 return message
         problem = ""
     except Exception as error:  # noqa: BLE001 (the slow path names the field)
         problem = str(error) if isinstance(error, ValidationError) else ""
     raise _refusal(payload, expected, problem)
+
+
+def remembering_decode(on_skipped: Callable[[int], None]) -> Callable[[bytes, type], object]:
+    """Return `decode` with a memory for small messages, which are immutable."""
+
+    def read(payload: bytes, kind: type) -> object:
+        return decode(payload, kind, on_skipped)
+
+    remembered = lru_cache(REMEMBERED)(read)
+
+    def read_or_recall(payload: bytes, kind: type) -> object:
+        small = len(payload) <= REMEMBERED_BYTES
+        return remembered(payload, kind) if small else read(payload, kind)
+
+    return read_or_recall
+
+
+def _known(value: Any, hint: Any) -> tuple[Any, int]:  # noqa: ANN401 (annotations have no type)
+    """Return a part of a message without fields that its class does not have, and their number."""
+    hint = next((one for one in _options(hint) if one is not NoneType), hint)
+    if isinstance(hint, type) and issubclass(hint, Struct) and isinstance(value, list):
+        names = [one.name for one in fields(hint)]
+        hints = get_type_hints(hint, include_extras=True)
+        pairs = [_known(item, hints[name]) for name, item in zip(names, value, strict=False)]
+        skipped = max(0, len(value) - len(names))
+    elif get_args(hint)[1:] == (Ellipsis,) and isinstance(value, list):
+        pairs, skipped = [_known(item, get_args(hint)[0]) for item in value], 0
+    elif get_origin(hint) is dict and isinstance(value, dict):
+        items = {key: _known(item, get_args(hint)[1]) for key, item in value.items()}
+        return (
+            {key: item for key, (item, _) in items.items()},
+            sum(count for _, count in items.values()),
+        )
+    else:
+        return value, 0
+    return [item for item, _ in pairs], skipped + sum(count for _, count in pairs)
 
 
 def _refusal(payload: bytes, expected: type | None, problem: str) -> BadInputError:

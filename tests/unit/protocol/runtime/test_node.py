@@ -271,7 +271,7 @@ def test_a_node_tells_what_it_has_counted(bench: Bench) -> None:
     node.deliver(Received(BEAT_KEY, b"nonsense"), 1.0)
     node.deliver(LinkDown(), 1.0)
     (found,) = node.metrics()
-    assert found == NodeMetrics(1, {"heartbeat": 1}, 1, 3, 0.0)
+    assert found == NodeMetrics(1, {"heartbeat": 1}, 1, 0, 3, 0.0)
 
 
 def test_end_closes_the_transport_and_nothing_is_handled_any_more(bench: Bench) -> None:
