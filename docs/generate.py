@@ -58,7 +58,7 @@ from laneweave.protocol.state_machine import Function, RuleBook
 from laneweave.protocol.summary import described
 from laneweave.protocol.vehicle.execution_rules import VEHICLE_RULES
 from laneweave.protocol.vehicle.plan_execution import ExecutionPhase
-from laneweave.protocol.wire import events, messages
+from laneweave.protocol.wire import events, messages, process_messages
 from laneweave.protocol.wire.identities import Identity
 from laneweave.protocol.wire.topics import TOPICS, Exchange, Party, Topic
 from laneweave.sim_bridge.core import BridgeMetrics
@@ -222,7 +222,7 @@ def _topics() -> str:
 def _messages() -> str:
     """Return a section for each message class: its docstring and a table of its fields."""
     sections = []
-    for node in _syntax(messages).body:
+    for node in (*_syntax(messages).body, *_syntax(process_messages).body):
         if isinstance(node, ast.ClassDef):
             lines = [f"### {node.name}\n\n{ast.get_docstring(node)}\n"]
             lines += ["| Field | Meaning |", "|---|---|"]

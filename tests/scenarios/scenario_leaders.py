@@ -14,7 +14,7 @@ from laneweave.coordinator.formations.roster import Formation
 from laneweave.protocol.lattice import PlannedMove, territory
 from laneweave.protocol.runtime import node
 from laneweave.protocol.state_machine import RuleBook
-from laneweave.protocol.wire import messages
+from laneweave.protocol.wire import messages, process_messages
 from laneweave.protocol.wire.topics import CENSUS, HEARTBEAT, STATE, Topic
 from scenarios.scenario_road import SCENARIO, SLOT_S, Vehicle
 from scenarios.scenario_text import cell_of, shown, written
@@ -160,7 +160,7 @@ class Candidate:
                 return post(mail, message, str(parameters["vehicle"]))
             case node.Send(_, messages.Heartbeat() as heartbeat):
                 self.heartbeat = heartbeat
-            case node.Send(_, messages.LogEvent() as event):
+            case node.Send(_, process_messages.LogEvent() as event):
                 return self._log(event)
             case node.Compute():
                 self.jobs.append(effect)
@@ -168,7 +168,7 @@ class Candidate:
                 pass
         return ""
 
-    def _log(self, event: messages.LogEvent) -> str:
+    def _log(self, event: process_messages.LogEvent) -> str:
         match event.kind:
             case "leader-elected":
                 return f"{self.name} leads, term {event.data['term']}"

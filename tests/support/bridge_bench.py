@@ -38,10 +38,10 @@ from laneweave.protocol.wire.messages import (
     CurrentMotion,
     Name,
     Prepare,
-    Report,
     Sense,
     VehicleRecord,
 )
+from laneweave.protocol.wire.process_messages import Report
 from laneweave.protocol.wire.topics import COMMAND, PLAN, PREPARE, REPORT, VEHICLE_ALIVE, Keys
 from laneweave.sim_bridge.bodies.bodies_world import BodiesWorld
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import Pose

@@ -13,14 +13,8 @@ from laneweave.coordinator.formations.operation import FormationsOperation
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.runtime.node import Arrived, Compute, Effect, Send, Started, Wakeup
 from laneweave.protocol.scenario.fields import Scenario
-from laneweave.protocol.wire.messages import (
-    Ballot,
-    Census,
-    CensusEntry,
-    LogEvent,
-    Name,
-    VehicleState,
-)
+from laneweave.protocol.wire.messages import Ballot, Census, CensusEntry, Name, VehicleState
+from laneweave.protocol.wire.process_messages import LogEvent
 from laneweave.protocol.wire.topics import CENSUS, STATE
 from support.paper import PAPER, closed_blocks
 from support.states import holding

@@ -60,7 +60,15 @@ def same(
     *, name: str, number: int, real: float, flag: bool = True, raw: bytes = b"", data: object = None
 ) -> Leaf:
     """Return a function that gives each simple field the value of its type."""
-    values = {Name: name, int: number, float: real, bool: flag, bytes: raw, dict[str, Any]: data}
+    values = {
+        Name: name,
+        str: name,
+        int: number,
+        float: real,
+        bool: flag,
+        bytes: raw,
+        dict[str, Any]: data,
+    }
     return values.__getitem__
 
 
@@ -69,6 +77,7 @@ def different() -> Leaf:
     numbers = itertools.count(1)
     makers: dict[Any, Callable[[int], Any]] = {
         Name: "v{}".format,
+        str: "text {}".format,
         int: lambda number: -number,
         float: lambda number: number + 0.5,
         bool: lambda number: number % 2 == 1,

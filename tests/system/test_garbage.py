@@ -17,7 +17,8 @@ from msgspec.structs import replace
 from laneweave.protocol.security.connection import Access
 from laneweave.protocol.transports.zenoh.transport import ZenohTransport
 from laneweave.protocol.wire.codec import KINDS, MAX_BYTES, VERSION, encode
-from laneweave.protocol.wire.messages import Census, Heartbeat, LogEvent, Name, Report, RoadClock
+from laneweave.protocol.wire.messages import Census, Heartbeat, Name, RoadClock
+from laneweave.protocol.wire.process_messages import LogEvent, Report
 from laneweave.protocol.wire.topics import (
     BRIDGE_ALIVE,
     COORDINATOR_ALIVE,

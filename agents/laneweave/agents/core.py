@@ -57,12 +57,12 @@ from laneweave.protocol.wire.messages import (
     Name,
     Plan,
     Prepare,
-    Report,
     Sense,
     VehicleRecord,
     VehicleState,
 )
 from laneweave.protocol.wire.newest import NewestRoad
+from laneweave.protocol.wire.process_messages import Report
 from laneweave.protocol.wire.topics import (
     COMMAND,
     MOTION,

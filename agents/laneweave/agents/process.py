@@ -11,13 +11,16 @@ from laneweave.agents.host import AgentHost
 from laneweave.protocol.lattice import displacements
 from laneweave.protocol.runtime.message_faults import CoreWrapper, unwrapped
 from laneweave.protocol.runtime.metrics import Observe, unobserved
+from laneweave.protocol.runtime.settings_check import CheckedCore, Process
+from laneweave.protocol.scenario.common_settings import AGENT_GROUPS, CommonSettings
 from laneweave.protocol.scenario.deployment_fields import Shard
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.security.connection import Access
 from laneweave.protocol.transports.zenoh.runner import run_core
 from laneweave.protocol.vehicle.motion import cell_state
-from laneweave.protocol.wire.identities import Incarnations
+from laneweave.protocol.wire.identities import Incarnations, parse_identity
 from laneweave.protocol.wire.messages import CurrentMotion, Name, Sense, VehicleRecord
+from laneweave.protocol.wire.topics import SENSE
 
 
 def warm_up(scenario: Scenario) -> None:
@@ -63,11 +66,17 @@ def run_agents(
         BadInputError: no router answers at the endpoint.
     """
     incarnations = Incarnations()
+    incarnation = incarnations()
+    names = [Name(vehicle) for vehicle in vehicles]
     host = AgentHost(
         lambda vehicle: AgentCore(vehicle, incarnations, scenario),
-        incarnations(),
+        incarnation,
         scenario.runtime,
-        [Name(vehicle) for vehicle in vehicles],
+        names,
         shard,
     )
-    run_core(wrap(host), access, observe=observe)
+    drives = "named" if shard is None else shard.name
+    process = Process.of(parse_identity(access.identity), incarnation, drives)
+    settings = CommonSettings.of(scenario)
+    core = CheckedCore(host, process, settings, SENSE, AGENT_GROUPS)
+    run_core(wrap(core), access, observe=observe)

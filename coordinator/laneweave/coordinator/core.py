@@ -50,13 +50,12 @@ from laneweave.protocol.wire.messages import (
     Ballot,
     Census,
     Heartbeat,
-    LogEvent,
     Name,
-    Report,
     RoadClock,
     VehicleState,
 )
 from laneweave.protocol.wire.newest import NewestRoad
+from laneweave.protocol.wire.process_messages import LogEvent, Report
 from laneweave.protocol.wire.topics import (
     BRIDGE_ALIVE,
     CENSUS,

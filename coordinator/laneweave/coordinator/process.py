@@ -24,12 +24,15 @@ from laneweave.protocol.runtime.metrics import (
     unobserved,
 )
 from laneweave.protocol.runtime.processes import accepted_stop_signals
+from laneweave.protocol.runtime.settings_check import CheckedCore, Process
 from laneweave.protocol.runtime.worker_pool import WorkerPool
+from laneweave.protocol.scenario.common_settings import CommonSettings
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.security.access_control import access_of
 from laneweave.protocol.transports.zenoh.runner import run_core
-from laneweave.protocol.wire.identities import Incarnations
+from laneweave.protocol.wire.identities import Identity, Incarnations
 from laneweave.protocol.wire.messages import Name
+from laneweave.protocol.wire.topics import CENSUS, Party
 
 
 @frozen
@@ -74,19 +77,22 @@ def run_coordinator(
             ROLLING.load()
         BRANCHING.load_if_compiled()
     workers = scenario.service.workers or max(1, len(os.sched_getaffinity(0)) - 1)
+    incarnation = Incarnations()()
     core = CoordinatorCore(
         Name(name),
-        Incarnations()(),
+        incarnation,
         scenario,
         workers=workers,
         plan=partial(plan, compiled_only=True),
     )
+    process = Process.of(Identity(Party.COORDINATOR, name), incarnation)
+    checked = CheckedCore(core, process, CommonSettings.of(scenario), CENSUS)
     with contextlib.closing(WorkerPool(workers, _load_branching)) as pool:
         if fork_workers:
             pool.fork()  # before the compilation starts a thread
         with contextlib.closing(BackgroundCompilation(BRANCHING)):
             access = access_of(scenario, f"coordinator.{name}")
-            run_core(wrap(core), access, pool, partial(_observe_solvers, observe))
+            run_core(wrap(checked), access, pool, partial(_observe_solvers, observe))
 
 
 def _load_branching() -> None:

@@ -12,7 +12,8 @@ from laneweave.protocol.road_layout import Exits, LaneSection
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.summary import Ending
 from laneweave.protocol.wire.events import PLANNING_FAILED
-from laneweave.protocol.wire.messages import ClosedFormation, Heartbeat, LogEvent, Name, Report
+from laneweave.protocol.wire.messages import ClosedFormation, Heartbeat, Name
+from laneweave.protocol.wire.process_messages import LogEvent, Report
 from laneweave.sim_bridge.bodies.command_checks import Refusal
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import MinGaps
 from laneweave.sim_bridge.recording.run_record import RecordedVehicle

@@ -37,16 +37,10 @@ from laneweave.protocol.scenario.deployment_fields import Runtime
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.summary import Ending
 from laneweave.protocol.wire.events import AGENT_MISSING
-from laneweave.protocol.wire.messages import (
-    Command,
-    Heartbeat,
-    LogEvent,
-    Name,
-    Plan,
-    Prepare,
-    Report,
-)
+from laneweave.protocol.wire.messages import Command, Heartbeat, Name, Plan, Prepare
+from laneweave.protocol.wire.process_messages import LogEvent, Report
 from laneweave.protocol.wire.topics import (
+    CENSUS,
     EVENT,
     HEARTBEAT,
     REPORT,
@@ -56,6 +50,7 @@ from laneweave.sim_bridge.recording.record_interface import Record
 from laneweave.sim_bridge.road.caretakers import notify_left
 from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.road.demand_queue import NO_OUTSIDE_TRAFFIC, OutsideTraffic
+from laneweave.sim_bridge.road.deployment import Deployment
 from laneweave.sim_bridge.road.roadside import Roadside
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
 from laneweave.sim_bridge.simulated_road import SimulatedRoad
@@ -66,6 +61,8 @@ CATCH_UP_S = 1.0
 """Maximum delay of the road that later, shorter ticks make up for [s, on the node's clock]."""
 SHUT_DOWN_S = 2.0
 """Maximum wait for final reports after a run has ended."""
+CENSUS_S = 1.0
+"""Period of the census while a tick waits for agents at the entrance [s, on the node's clock]."""
 REPORT_TICKS = 600
 """Number of ticks after a vehicle has left for which the final report of its agent is awaited."""
 
@@ -181,8 +178,9 @@ class BridgeCore:
         """Tick and name of each vehicle that has left in the last `REPORT_TICKS`."""
         self._stopwatch = stopwatch
         self._tick_began = 0.0
-        self._agent_wait_s = scenario.runtime.agent_start_s
-        """Maximum wait for agents at the entrance."""
+        self._deployment = Deployment(scenario, incarnation, record)
+        self._opened_s = self._census_s = 0.0
+        """When the current tick was opened; when the census is published next if it waits."""
         self._ending = Ending.COMPLETE
         self._until_s = 0.0
         """Deadline for all phases except ANSWERS."""
@@ -226,11 +224,14 @@ class BridgeCore:
         """Time of the next resend, deadline or tick."""
         match self.phase:
             case TickPhase.ANSWERS:
-                return min(self._answers.resend_s, self._answers.deadline_s)
-            case TickPhase.AGENTS | TickPhase.PACE | TickPhase.SHUTTING_DOWN:
-                return self._until_s
+                wakeup_s = min(self._answers.resend_s, self._answers.deadline_s)
+            case TickPhase.AGENTS:
+                wakeup_s = min(self._until_s, self._census_s)
+            case TickPhase.PACE | TickPhase.SHUTTING_DOWN:
+                wakeup_s = self._until_s
             case _:
                 return None
+        return min(wakeup_s, self._deployment.wakeup_s)
 
     def handle(self, event: Event, now_s: float) -> list[Effect]:
         """Handle an event; see `Core`."""
@@ -243,21 +244,25 @@ class BridgeCore:
             effects = [Refuse(error)]
         if self.phase is not TickPhase.ANSWERS or self._answers.complete(now_s):
             effects += self._proceed(now_s)
+        if now_s >= self._deployment.wakeup_s and self.phase is not TickPhase.ENDED:
+            effects += self._deployment.publish(now_s)
         return effects
 
     def _on_event(self, event: Event, now_s: float) -> Iterator[Effect]:
         self.road.caretakers.on_network(event, now_s)
+        self._deployment.on_event(event, self.t_s, now_s)
         match event:
             case Started():
                 for subscribed in (EVENT, REPORT, HEARTBEAT):
                     yield Listen(subscribed)
+                # First: processes compare settings before they act.
+                yield from self._deployment.start(now_s)
                 yield from self.road.connect()
                 self._pace.start(now_s)
                 self._open_tick(now_s)
             case Arrived(_, parameters, message):
                 yield from self._on_message(message, parameters, now_s)
             case PeerUp(topic, parameters) if topic is VEHICLE_ALIVE:
-                self._agent_wait_s = self._scenario.runtime.agent_start_s
                 if parameters["vehicle"] in self.vehicles:
                     self._unreported.add(parameters["vehicle"])
             case Wakeup() if self.phase is TickPhase.ANSWERS:
@@ -306,11 +311,16 @@ class BridgeCore:
         if self.phase is TickPhase.PACE and now_s >= self._until_s:
             self._open_tick(now_s)
         if self.phase is TickPhase.AGENTS:
-            missing = any(each.name not in self._answers.up for each in self.road.at_entrance)
-            if not missing or now_s >= self._until_s:
+            self._until_s = max(self._waits_until_s(now_s), default=now_s)
+            if now_s >= self._until_s:
                 self._enter()
                 yield from self.road.begin_tick(now_s)
                 self.phase = TickPhase.ANSWERS
+            elif now_s >= self._census_s:
+                # A fleet that was restarted learns of its vehicles.
+                self._census_s = now_s + CENSUS_S
+                publisher, at_entrance = self._roadside.publisher, self.road.at_entrance
+                yield Send(CENSUS, publisher.census(self.t_s, self.vehicles.values(), at_entrance))
         if self.phase is TickPhase.ANSWERS and self._answers.complete(now_s):
             yield from self._end_tick(now_s)
         if self.phase is TickPhase.SHUTTING_DOWN and (
@@ -319,13 +329,19 @@ class BridgeCore:
             self._finish(self._ending)
             yield End()
 
+    def _waits_until_s(self, now_s: float) -> Iterator[float]:
+        """Yield until when the tick waits for each agent that is missing at the entrance."""
+        for vehicle in self.road.at_entrance:
+            if vehicle.name not in self._answers.up:
+                yield self._opened_s + self._deployment.wait_s(vehicle.name, now_s)
+
     def _open_tick(self, now_s: float) -> None:
         """Admit vehicles at the entrance and start waiting for their agents."""
         self._pace.open_tick(now_s)
         self._tick_began = self._stopwatch()
         self.road.admit()
         self.phase = TickPhase.AGENTS
-        self._until_s = now_s + self._agent_wait_s
+        self._opened_s, self._census_s = now_s, now_s + CENSUS_S
 
     def _enter(self) -> None:
         for vehicle in self.road.enter():
@@ -334,8 +350,7 @@ class BridgeCore:
                 self._unreported.add(vehicle.name)
             else:
                 self._record.event(self.t_s, AGENT_MISSING, vehicle=vehicle.name)
-                # After a missing agent, wait only briefly for others until one appears.
-                self._agent_wait_s = self._scenario.network.resend_s
+                self._deployment.on_missing(vehicle.name)
 
     def _end_tick(self, now_s: float) -> Iterator[Effect]:
         road = self.road

@@ -13,15 +13,8 @@ from laneweave.protocol.lattice import Cell
 from laneweave.protocol.runtime.node import Effect, Send, Wakeup
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.vehicle_tables import Vehicle
-from laneweave.protocol.wire.messages import (
-    Ballot,
-    Command,
-    Name,
-    Prepare,
-    Report,
-    Sense,
-    VehicleState,
-)
+from laneweave.protocol.wire.messages import Ballot, Command, Name, Prepare, Sense, VehicleState
+from laneweave.protocol.wire.process_messages import Report
 from laneweave.protocol.wire.topics import PLAN, PREPARE, SENSE, STATE
 from support.agent_rig import HOME, ME, OTHER, Rig
 from support.states import BALLOT, changed, holding, make_plan, sense_in, sent

@@ -18,7 +18,8 @@ from laneweave.protocol.vehicle.execution_rules import drives_its_moves
 from laneweave.protocol.vehicle.lane_ends import LaneEnds
 from laneweave.protocol.vehicle.motion import ARRIVED_ACROSS_M, ARRIVED_ALONG_M
 from laneweave.protocol.wire import topics
-from laneweave.protocol.wire.messages import Command, Name, Neighbour, Prepare, Report
+from laneweave.protocol.wire.messages import Command, Name, Neighbour, Prepare
+from laneweave.protocol.wire.process_messages import Report
 from support.agent_rig import HOME, ME, MOVE_TICKS, OTHER, SCENARIO, TICK_S, Rig, up_and_running
 from support.closed_lanes import DROP
 from support.states import BALLOT, changed, holding, make_plan, sent

@@ -22,9 +22,9 @@ from laneweave.protocol.wire.messages import (
     Command,
     Name,
     Prepare,
-    Report,
     VehicleState,
 )
+from laneweave.protocol.wire.process_messages import Report
 from support.paper import PAPER
 from support.states import BALLOT, make_plan, sense_in, sent
 

@@ -46,13 +46,12 @@ from laneweave.protocol.wire.messages import (
     Ballot,
     Census,
     Heartbeat,
-    LogEvent,
     Name,
     Plan,
     Prepare,
-    Report,
     RoadClock,
 )
+from laneweave.protocol.wire.process_messages import LogEvent, Report
 from laneweave.protocol.wire.topics import (
     BRIDGE_ALIVE,
     CENSUS,

@@ -320,7 +320,7 @@ def test_at_half_of_all_messages_lost_the_road_keeps_real_time_and_agents_stay_i
 @pytest.mark.parametrize("delay_s", variants([0.02, 0.002]))
 def test_messages_that_are_not_lost_are_waited_for(tmp_path: Path, delay_s: float) -> None:
     """A process that is late now and then, or a long way, is no reason to hurry."""
-    conditions = Conditions(delay_s=delay_s, jitter_s=0.07)
+    conditions = Conditions(delay_s=delay_s, jitter_s=0.06)
     street = Street(LONG_ROAD, tmp_path, MANY, conditions, pace=PACE)
     for one in MANY:
         street.start_agents(one.vehicle)

@@ -21,7 +21,8 @@ from laneweave.protocol.runtime.node import (
 from laneweave.protocol.runtime.transport import LinkDown, LinkUp
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.wire import topics
-from laneweave.protocol.wire.messages import Census, CurrentMotion, Name, Report, RoadClock, Sense
+from laneweave.protocol.wire.messages import Census, CurrentMotion, Name, RoadClock, Sense
+from laneweave.protocol.wire.process_messages import Report
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import pose_of
 from laneweave.sim_bridge.core import CATCH_UP_S, SHUT_DOWN_S, TickPhase
 from laneweave.sim_bridge.road.caretakers import LEFT_REPEATS

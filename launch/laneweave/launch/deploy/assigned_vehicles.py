@@ -80,7 +80,7 @@ def _fleet_of_shard(security: Security, shard: Shard) -> str:
         raise BadInputError(
             "--shard", text, "a shard of security.fleets, because security.mode is mtls"
         )
-    return f"{shard.index}-of-{shard.count}"
+    return shard.name
 
 
 def _shard(members: FleetMembers) -> Shard | None:

@@ -7,14 +7,8 @@ from collections.abc import Iterable, Iterator
 from laneweave.launch.fault_search.checks.claims import short
 from laneweave.launch.fault_search.checks.violations import Violation
 from laneweave.protocol.runtime.node import Send
-from laneweave.protocol.wire.messages import (
-    Command,
-    Heartbeat,
-    LogEvent,
-    Plan,
-    Prepare,
-    VehicleState,
-)
+from laneweave.protocol.wire.messages import Command, Heartbeat, Plan, Prepare, VehicleState
+from laneweave.protocol.wire.process_messages import LogEvent
 
 BEFORE_S = 4.0
 """How long before the first violation the printed timeline begins."""

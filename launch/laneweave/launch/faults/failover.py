@@ -14,7 +14,7 @@ from collections import deque
 from attrs import define, field
 
 from laneweave.launch.observe.road_view import RoadView
-from laneweave.protocol.wire.messages import LogEvent
+from laneweave.protocol.wire.process_messages import LogEvent
 
 IN_FORCE = "plan-in-force"
 IN_FLIGHT_S = 0.05

@@ -17,15 +17,9 @@ from laneweave.protocol.runtime.node import Arrived, PeerDown, PeerUp
 from laneweave.protocol.runtime.transport import LinkDown, LinkUp
 from laneweave.protocol.scenario.deployment_fields import HIGHEST_PACE
 from laneweave.protocol.wire.bounds import Bounds
-from laneweave.protocol.wire.messages import (
-    Census,
-    Heartbeat,
-    LogEvent,
-    Name,
-    RoadClock,
-    VehicleState,
-)
+from laneweave.protocol.wire.messages import Census, Heartbeat, Name, RoadClock, VehicleState
 from laneweave.protocol.wire.newest import NewestRoad
+from laneweave.protocol.wire.process_messages import LogEvent
 from laneweave.protocol.wire.topics import (
     BRIDGE_ALIVE,
     COORDINATOR_ALIVE,

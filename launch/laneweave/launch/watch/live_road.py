@@ -26,15 +26,8 @@ from laneweave.protocol.lattice import Cell
 from laneweave.protocol.road_layout import ANY_LANE
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.lane_ends import LaneEnds
-from laneweave.protocol.wire.messages import (
-    CAR,
-    Ballot,
-    CensusEntry,
-    LogEvent,
-    Name,
-    Plan,
-    VehicleState,
-)
+from laneweave.protocol.wire.messages import CAR, Ballot, CensusEntry, Name, Plan, VehicleState
+from laneweave.protocol.wire.process_messages import LogEvent
 from laneweave.protocol.wire.topics import CENSUS, CLOCK, EVENT, HEARTBEAT, PLAN, STATE
 
 TOPICS = (STATE, CLOCK, CENSUS, HEARTBEAT, PLAN, EVENT)

@@ -31,10 +31,10 @@ from laneweave.protocol.runtime.node import (
     core_metrics,
 )
 from laneweave.protocol.wire.messages import RoadClock
-from laneweave.protocol.wire.topics import ANY_SENDER, ROLES, TOPICS
+from laneweave.protocol.wire.topics import ANY_SENDER, ROLES, TOPICS, Party
 
-SENDER_OF_ROLE = {role: str(party) for party, role in ROLES.items()}
-"""Kind of sender in message rules, by role."""
+SENDER_OF_ROLE = {role: str(party) for party, role in ROLES.items() if party is not Party.FLEET}
+"""Kind of sender in message rules, by role; fleets send as their vehicles."""
 SENDERS = tuple(SENDER_OF_ROLE.values())
 MESSAGE_TOPICS = tuple(topic.name for topic in TOPICS if topic.kind is not None)
 _SENDER = attrs.validators.optional(one_of(*SENDERS))

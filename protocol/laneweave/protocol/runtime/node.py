@@ -32,7 +32,8 @@ from laneweave.protocol.runtime.transport import (
     Transport,
 )
 from laneweave.protocol.wire.codec import decode, encode, remembering_decode
-from laneweave.protocol.wire.messages import Name, Report
+from laneweave.protocol.wire.messages import Name
+from laneweave.protocol.wire.process_messages import Report
 from laneweave.protocol.wire.topics import SERVICE, Keys, Topic, key_of
 
 log = structlog.get_logger(__name__)
@@ -317,7 +318,9 @@ class Node:
         self._transport = transport
         self._keys = keys
         self._submit = submit
-        self._read = read or partial(read_message, keys, decode=remembering_decode(self._on_skipped))
+        self._read = read or partial(
+            read_message, keys, decode=remembering_decode(self._on_skipped)
+        )
         self._write = write
         self._encoded: tuple[object, bytes] = (None, b"")
         """Last encoded message and its bytes, reused because a plan goes to several vehicles."""

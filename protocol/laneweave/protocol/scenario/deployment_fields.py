@@ -34,6 +34,11 @@ class Shard:
     index: int
     count: int
 
+    @property
+    def name(self) -> str:
+        """Name of the shard in keys: `I-of-N`."""
+        return f"{self.index}-of-{self.count}"
+
     def contains(self, vehicle: str) -> bool:
         """Return whether a vehicle belongs to this shard; all processes agree."""
         return zlib.crc32(vehicle.encode()) % self.count == self.index

@@ -26,7 +26,7 @@ from msgspec.structs import fields
 from laneweave.protocol.errors import NO_VALUE, BadInputError
 from laneweave.protocol.names import NAME_RULE
 from laneweave.protocol.wire.field_types import Message
-from laneweave.protocol.wire.messages import LogEvent
+from laneweave.protocol.wire.process_messages import LogEvent
 from laneweave.protocol.wire.topics import TOPICS
 
 VERSION = 2

@@ -63,6 +63,8 @@ AGENT_TOOK_OVER: Final = "agent-took-over"
 """Bridge: an agent has taken charge of a vehicle from its caretaker or an earlier agent."""
 COMMAND_REFUSED: Final = "command-refused"
 """Bridge: a motion controller has refused a command that no correct agent sends (or several)."""
+SETTINGS_REFUSED: Final = "settings-refused"
+"""Bridge: a process has other settings than the bridge, and so does not act on its road."""
 OVERLAP: Final = "overlap"
 """Bridge: two bodies intersect; a closed part of a lane counts as a body named `closure-N`."""
 RUN_ENDED: Final = "run-ended"
@@ -106,6 +108,7 @@ FIELDS: Final[Mapping[str, tuple[str, ...]]] = {
     CARETAKER_TOOK_OVER: ("vehicle", "reason"),
     AGENT_TOOK_OVER: ("vehicle", "previous"),
     COMMAND_REFUSED: ("vehicle", "reason", "excess_m", "occupant"),
+    SETTINGS_REFUSED: ("process", "incarnation", "settings"),
     OVERLAP: ("vehicles",),
     RUN_ENDED: ("ending",),
 }

@@ -1,16 +1,17 @@
-"""All messages: senders, receivers, rates, units, and the effect of loss, delay and duplication.
+"""Messages about vehicles and the road: senders, receivers, rates, units, effect of loss and delay.
 
 Messages are frozen msgspec structs, which travel as arrays of their fields in the order given here.
 `codec` encodes them as MessagePack and checks field types and ranges when decoding, so a core never
-receives a malformed message. New fields come last and have a default.
+receives a malformed message. New fields come last and have a default. `process_messages` has the
+messages about processes.
 `t_s` is road time [s], the clock that moves the lattice; it advances in ticks. A cell is (column,
 lane) in the lattice frame. The sections of docs/PROTOCOL.md on messages are generated from the
-docstrings of this module.
+docstrings of both modules.
 """
 
 from __future__ import annotations
 
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 from msgspec import field
 
@@ -453,47 +454,3 @@ class RoadClock(Message, frozen=True):
     """Whether the run is over."""
     bridge: Int64 = 0
     """Incarnation of the bridge [ns]; a new value means a new road; 0: not given."""
-
-
-class Report(Message, frozen=True):
-    """Any role to the recorder: the sender's counters.
-
-    Sent by agents when their vehicle has left or they are stopped, by the bridge when its run ends,
-    and by coordinators every 2 s and when they are stopped. Missing: not included in the
-    summary; when a run ends, the bridge waits up to 2 s for the reports from all agents. Late: not
-    recorded. Duplicated: the newest report from a sender counts. The summary takes the maximum of
-    `published` and of `rejected` over the senders of a process, and sums all other counters.
-    """
-
-    role: Name
-    name: Name
-    process: Name = Name("unknown")
-    """Process of the sender, set by the node; several vehicles may share one."""
-    published: Int64 = 0
-    """Number of messages published by the process, including this one; set by the node."""
-    rejected: Int64 = 0
-    """Number of malformed messages received by the process; set by the node."""
-    solves: Int64 = 0
-    """Number of ticks at which a reference was tracked."""
-    unusable: Int64 = 0
-    """Number of solves without a usable solution."""
-    osqp_solves: Int64 = 0
-    """Number of solves with OSQP; in the rest the unconstrained optimum met all constraints."""
-    solve_ms: bytes = b""
-    """CPU time of each solve [ms], little-endian float32."""
-
-
-class LogEvent(Message, frozen=True):
-    """Any role to the recorder, for each event: a line in `events.jsonl`.
-
-    Currently only coordinators send events; the bridge writes its own directly. Missing, or
-    late because the run has ended: not recorded. Duplicated: recorded twice.
-    """
-
-    role: Name
-    name: Name
-    t_s: Real
-    kind: Name
-    """One of the names in `wire.events`."""
-    data: dict[str, Any] = field(default_factory=dict)
-    """Details, as JSON values."""

@@ -18,7 +18,7 @@ from attrs import frozen
 
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.names import NAME_PATTERN, NAME_RULE
-from laneweave.protocol.wire import messages
+from laneweave.protocol.wire import messages, process_messages
 from laneweave.protocol.wire.field_types import Message
 
 PREFIX = "laneweave"
@@ -66,8 +66,13 @@ class Party(StrEnum):
 
 
 ANY_SENDER = "any"
-"""Vehicles, coordinators and the bridge, whose {role} and {name} are in the key."""
-ROLES = {Party.VEHICLE: "agent", Party.COORDINATOR: "coordinator", Party.BRIDGE: "bridge"}
+"""Vehicles, fleets, coordinators and the bridge, whose {role} and {name} are in the key."""
+ROLES = {
+    Party.VEHICLE: "agent",
+    Party.FLEET: "fleet",
+    Party.COORDINATOR: "coordinator",
+    Party.BRIDGE: "bridge",
+}
 """Role of each party in the keys of topics with `ANY_SENDER`."""
 
 
@@ -156,14 +161,29 @@ HEARTBEAT = Topic(
     readers=(Party.COORDINATOR, Party.BRIDGE, Party.OBSERVER),
 )  # fmt: skip
 REPORT = Topic(
-    "report", "report/{role}/{name}", messages.Report, ANY_SENDER, Quality.ASSURED,
+    "report", "report/{role}/{name}", process_messages.Report, ANY_SENDER, Quality.ASSURED,
     readers=(Party.BRIDGE, Party.OBSERVER),
     remark="the bridge's recorder",
 )  # fmt: skip
 EVENT = Topic(
-    "event", "event/{role}/{name}", messages.LogEvent, ANY_SENDER, Quality.ASSURED,
+    "event", "event/{role}/{name}", process_messages.LogEvent, ANY_SENDER, Quality.ASSURED,
     readers=(Party.BRIDGE, Party.OBSERVER),
     remark="the bridge's recorder; so far only coordinators send events",
+)  # fmt: skip
+SETTINGS = Topic(
+    "settings", "settings/{role}/{name}", process_messages.ProcessSettings, ANY_SENDER,
+    Quality.LATEST,
+    readers=(Party.BRIDGE, Party.COORDINATOR, Party.VEHICLE, Party.FLEET, Party.OBSERVER),
+    long=True,
+    remark="all but observers: only while a process does not fit",
+)  # fmt: skip
+# Every process that acts on the road: who it is, and digests of the settings that all must share.
+PROCESS_ALIVE = Topic(
+    "process-alive", "alive/process/{role}/{name}/{incarnation}/{drives}/{digests}", None,
+    ANY_SENDER, Quality.ASSURED,
+    readers=(Party.BRIDGE, Party.COORDINATOR, Party.VEHICLE, Party.FLEET, Party.OBSERVER),
+    exchange=Exchange.TOKENS,
+    remark="all but observers: those of the bridge; the bridge: those of fleets, too",
 )  # fmt: skip
 COORDINATOR_ALIVE = Topic(
     "coordinator-alive", "alive/coordinator/{coordinator}/{incarnation}", None, Party.COORDINATOR,

@@ -11,7 +11,8 @@ from attrs import define, field
 from numpy.typing import NDArray
 
 from laneweave.protocol.summary import DurationMs
-from laneweave.protocol.wire.messages import Name, Report
+from laneweave.protocol.wire.messages import Name
+from laneweave.protocol.wire.process_messages import Report
 from laneweave.sim_bridge.recording.statistics import finite
 
 MAX_SENDERS = 256

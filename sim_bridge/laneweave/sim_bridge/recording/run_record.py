@@ -58,7 +58,8 @@ from laneweave.protocol.wire.events import (
     OVERLAP,
     RUN_ENDED,
 )
-from laneweave.protocol.wire.messages import ClosedFormation, Heartbeat, LogEvent, Name, Report
+from laneweave.protocol.wire.messages import ClosedFormation, Heartbeat, Name
+from laneweave.protocol.wire.process_messages import LogEvent, Report
 from laneweave.sim_bridge.bodies.command_checks import Refusal
 from laneweave.sim_bridge.bodies.motion_controller import FallbackLevel
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import MinGaps

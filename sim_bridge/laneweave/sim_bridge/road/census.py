@@ -18,7 +18,7 @@ from laneweave.protocol.wire.messages import (
     RoadClock,
 )
 from laneweave.protocol.wire.topics import CENSUS, CLOCK
-from laneweave.sim_bridge.road.demand_queue import DemandQueue, OutsideTraffic
+from laneweave.sim_bridge.road.demand_queue import DemandQueue, OutsideTraffic, announcement_of
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
 
 CENSUS_EVERY_TICKS = 10
@@ -96,8 +96,16 @@ class CensusPublisher:
         self._announced = self._demand.announcements(t_s)
         return self._announced != before
 
-    def census(self, t_s: float, on_road: Iterable[RoadVehicle]) -> Census:
-        """Return the census: vehicles on the road, announcements and closed formations."""
+    def census(
+        self,
+        t_s: float,
+        on_road: Iterable[RoadVehicle],
+        at_entrance: Iterable[RoadVehicle] = (),
+    ) -> Census:
+        """Return the census: vehicles on the road, announcements and closed formations.
+
+        Vehicles at the entrance, which enter with the next tick, are announced.
+        """
         vehicles = tuple(on_road)
         off_lattice = self._off_lattice({vehicle.name: vehicle for vehicle in vehicles})
         # A formation without members on the lattice counts as deserted; others may have joined it.
@@ -118,7 +126,10 @@ class CensusPublisher:
                 )
                 for vehicle in vehicles
             ),
-            announced=self._announced,
+            announced=(
+                *(announcement_of(one.admission.arrival) for one in at_entrance),
+                *self._announced,
+            ),
             formations=tuple(self._closed),
             closed_to=self._closed_to,
             bridge=self._bridge,

@@ -178,11 +178,16 @@ class DemandQueue:
                 room[arrival.entry_point] -= 1
                 coming.append(arrival)
         return tuple(
-            Announcement(
-                vehicle=Name(arrival.vehicle),
-                lane=arrival.lane,
-                preferred_lane=arrival.preferred_lane,
-                arrival_s=arrival.t_s,
-            )
+            announcement_of(arrival)
             for arrival in sorted(coming, key=lambda arrival: (arrival.t_s, arrival.vehicle))
         )
+
+
+def announcement_of(arrival: Arrival) -> Announcement:
+    """Return the announcement of an arrival."""
+    return Announcement(
+        vehicle=Name(arrival.vehicle),
+        lane=arrival.lane,
+        preferred_lane=arrival.preferred_lane,
+        arrival_s=arrival.t_s,
+    )

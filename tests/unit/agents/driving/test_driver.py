@@ -25,7 +25,8 @@ from laneweave.protocol.vehicle.motion import (
     integrate,
     limited_jerk,
 )
-from laneweave.protocol.wire.messages import CurrentMotion, Neighbour, Report, Sense
+from laneweave.protocol.wire.messages import CurrentMotion, Neighbour, Sense
+from laneweave.protocol.wire.process_messages import Report
 from laneweave.protocol.wire.topics import SENSE
 from laneweave.sim_bridge.bodies.motion_controller import FallbackLevel
 from laneweave.sim_bridge.bodies.plant import Plant

@@ -12,7 +12,8 @@ from laneweave.protocol.lattice import PlannedMove
 from laneweave.protocol.runtime.node import Compute, Effect, run_job
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.plans import plan_problems
-from laneweave.protocol.wire.messages import Ballot, LogEvent, Name, Plan
+from laneweave.protocol.wire.messages import Ballot, Name, Plan
+from laneweave.protocol.wire.process_messages import LogEvent
 from support.paper import FORMATIONS, PAPER
 from support.service_desk import Cells, Desk, jobs, leading, messages, state
 from support.states import A, B, C, D, E, F, make_plan

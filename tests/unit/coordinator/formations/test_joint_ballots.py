@@ -11,7 +11,8 @@ from laneweave.coordinator.formations.operation import JUST_CLOSED_S
 from laneweave.protocol.runtime.node import Compute, Effect, run_job
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.plans import plan_problems
-from laneweave.protocol.wire.messages import Ballot, LogEvent, Name, Plan, Prepare, RoadClock
+from laneweave.protocol.wire.messages import Ballot, Name, Plan, Prepare, RoadClock
+from laneweave.protocol.wire.process_messages import LogEvent
 from support.paper import PAPER, closing_time_s
 from support.service_desk import T_S, Cells, Desk, census, jobs, leading, logged, messages, state
 from support.states import A, B, C, D, E, F, changed

@@ -9,7 +9,8 @@ import pytest
 
 from laneweave.launch.faults.failover import IN_FORCE, Failover
 from laneweave.launch.observe.road_view import RoadView
-from laneweave.protocol.wire.messages import Heartbeat, LogEvent, Name, RoadClock
+from laneweave.protocol.wire.messages import Heartbeat, Name, RoadClock
+from laneweave.protocol.wire.process_messages import LogEvent
 
 C1, C2 = Name("c1"), Name("c2")
 START_S = 100.0

@@ -16,7 +16,8 @@ from laneweave.protocol.runtime.transport import LinkDown, LinkUp
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.lane_ends import dead_ends
 from laneweave.protocol.wire.codec import decode, encode
-from laneweave.protocol.wire.messages import ClosedFormation, Heartbeat, LogEvent, Name
+from laneweave.protocol.wire.messages import ClosedFormation, Heartbeat, Name
+from laneweave.protocol.wire.process_messages import LogEvent
 from support.closed_lanes import DROP
 from support.convoy import BALLOT, ROLLING, Convoy
 from support.states import changed

@@ -13,7 +13,8 @@ from laneweave.protocol.runtime.message_faults import FaultyCore, MessageRule
 from laneweave.protocol.runtime.metrics import RouterMetrics
 from laneweave.protocol.runtime.transport import LinkDown, LinkUp
 from laneweave.protocol.wire import topics
-from laneweave.protocol.wire.messages import Heartbeat, LogEvent, Name, Report, RoadClock
+from laneweave.protocol.wire.messages import Heartbeat, Name, RoadClock
+from laneweave.protocol.wire.process_messages import LogEvent, Report
 from support.node_recorder import Recorder, at_start, beat
 from support.refusals import refusal
 

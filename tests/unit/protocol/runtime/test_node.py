@@ -53,7 +53,8 @@ from laneweave.protocol.runtime.transport import (
 )
 from laneweave.protocol.wire import topics
 from laneweave.protocol.wire.codec import MAX_BYTES, decode, encode
-from laneweave.protocol.wire.messages import Heartbeat, LogEvent, Name, Report, RoadClock
+from laneweave.protocol.wire.messages import Heartbeat, Name, RoadClock
+from laneweave.protocol.wire.process_messages import LogEvent, Report
 from support.node_recorder import Recorder, at_start
 
 KEYS = topics.Keys("r")

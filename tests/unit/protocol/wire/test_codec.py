@@ -16,17 +16,10 @@ from msgspec.structs import FieldInfo, fields
 
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.names import NAME_PATTERN
-from laneweave.protocol.wire import messages
+from laneweave.protocol.wire import messages, process_messages
 from laneweave.protocol.wire.codec import KINDS, MAX_BYTES, VERSION, decode, encode
-from laneweave.protocol.wire.messages import (
-    Ballot,
-    Heartbeat,
-    Name,
-    Plan,
-    Report,
-    RoadClock,
-    Sense,
-)
+from laneweave.protocol.wire.messages import Ballot, Heartbeat, Name, Plan, RoadClock, Sense
+from laneweave.protocol.wire.process_messages import Report
 from support.examples import examples
 from support.refusals import refusal
 from support.tables import for_each
@@ -97,6 +90,7 @@ SIMPLE: dict[Any, st.SearchStrategy[Any]] = {
     bool: st.booleans(),
     bytes: st.binary(max_size=40),
     Name: NAMES,
+    str: st.text(max_size=40),
     NoneType: st.none(),
     Ballot: st.builds(Ballot, INTS, NAMES, INTS, INTS),
     dict[str, Any]: PLAIN,
@@ -160,8 +154,9 @@ def changed(sample: object, name: str, value: object) -> bytes:
 
 
 def test_every_class_of_a_message_has_a_sample() -> None:
-    of_module: list[type] = [one for one in vars(messages).values() if isinstance(one, type)]
-    classes = {one for one in of_module if one.__module__ == messages.__name__ and is_struct(one)}
+    modules = messages, process_messages
+    found = [one for module in modules for one in vars(module).values() if is_struct(one)]
+    classes = {one for one in found if one.__module__ in [module.__name__ for module in modules]}
     assert classes == set(HINTS)
 
 
@@ -294,6 +289,7 @@ def wrong_values(hint: Any) -> list[Any]:  # noqa: ANN401
         float: [*NUMBERS_NOT_ALLOWED, True, "1.0", None, [], {}, b"1"],
         bool: [0, 1, 0.0, "true", None, [], {}, b""],
         bytes: ["x", None, 1, [], [0, 0], {}, True],
+        str: [1, True, None, [], {}, b"v1", 1.5],
         Name: [*NAMES_NOT_ALLOWED, 1, True, None, [], {}, b"v1", 1.5],
         Ballot: [None, *BALLOTS_NOT_ALLOWED],
         Ballot | None: [*BALLOTS_NOT_ALLOWED],
@@ -314,7 +310,15 @@ def right_value(hint: Any) -> Any:  # noqa: ANN401
         return [] if parts[-1] is Ellipsis else [right_value(part) for part in parts]
     if NoneType in parts:
         return None
-    return {int: 1, float: 1.0, bool: True, bytes: b"", Name: "v1", Ballot: [1, "c", 2, 3]}[hint]
+    return {
+        int: 1,
+        float: 1.0,
+        bool: True,
+        bytes: b"",
+        Name: "v1",
+        str: "",
+        Ballot: [1, "c", 2, 3],
+    }[hint]
 
 
 @for_each(("sample", "name"), FIELDS)

@@ -7,7 +7,8 @@ import pytest
 from numpy.random import default_rng
 
 from laneweave.protocol.summary import DurationMs
-from laneweave.protocol.wire.messages import Name, Report
+from laneweave.protocol.wire.messages import Name
+from laneweave.protocol.wire.process_messages import Report
 from laneweave.sim_bridge.recording import reports as reports_module
 from laneweave.sim_bridge.recording.reports import MAX_SOLVE_MS, ReportTotals, SolveTimes
 from laneweave.sim_bridge.recording.statistics import finite

@@ -20,7 +20,8 @@ from laneweave import load_run
 from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.summary import Ending
-from laneweave.protocol.wire.messages import Heartbeat, LogEvent, Name, Report
+from laneweave.protocol.wire.messages import Heartbeat, Name
+from laneweave.protocol.wire.process_messages import LogEvent, Report
 from laneweave.sim_bridge.bodies.motion_controller import FallbackLevel
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import MinGaps
 from laneweave.sim_bridge.recording.columns import SCENARIO_KEY
