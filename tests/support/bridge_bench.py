@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -28,11 +29,14 @@ from laneweave.protocol.runtime.node import (
     Started,
     Wakeup,
 )
+from laneweave.protocol.runtime.settings_check import CheckedCore, Process
+from laneweave.protocol.scenario.common_settings import AGENT_GROUPS, CommonSettings
 from laneweave.protocol.scenario.deployment_fields import Shard
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.transports.simulated.network import SimulatedNetwork
 from laneweave.protocol.transports.simulated.virtual_time import Conditions
 from laneweave.protocol.wire.codec import encode
+from laneweave.protocol.wire.identities import Identity
 from laneweave.protocol.wire.messages import (
     Command,
     CurrentMotion,
@@ -42,7 +46,17 @@ from laneweave.protocol.wire.messages import (
     VehicleRecord,
 )
 from laneweave.protocol.wire.process_messages import Report
-from laneweave.protocol.wire.topics import COMMAND, PLAN, PREPARE, REPORT, VEHICLE_ALIVE, Keys
+from laneweave.protocol.wire.topics import (
+    CENSUS,
+    COMMAND,
+    PLAN,
+    PREPARE,
+    REPORT,
+    SENSE,
+    VEHICLE_ALIVE,
+    Keys,
+    Party,
+)
 from laneweave.sim_bridge.bodies.bodies_world import BodiesWorld
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import Pose
 from laneweave.sim_bridge.core import BRIDGE, BridgeCore, TickPhase
@@ -320,29 +334,51 @@ class Street:
 
     def start_coordinators(self, count: int = 1) -> None:
         for number in range(count):
-            name = Name(f"c{number}")
-            self._add(name, CoordinatorCore(name, number + 1, self.scenario))
+            self.start_coordinator(f"c{number}", number + 1)
+
+    def start_coordinator(
+        self, name: str, incarnation: int, scenario: Scenario | None = None
+    ) -> CoordinatorCore:
+        """Start a candidate, perhaps with a scenario of its own."""
+        scenario = scenario or self.scenario
+        core = CoordinatorCore(Name(name), incarnation, scenario)
+        process = Process.of(Identity(Party.COORDINATOR, name), incarnation)
+        self._add(name, CheckedCore(core, process, CommonSettings.of(scenario), CENSUS))
+        return core
 
     def start_agents(self, *vehicles: str) -> Sleeper:
         """Start one process for some vehicles."""
         names = [Name(vehicle) for vehicle in vehicles]
-        host = Sleeper(self._make_host(names))
-        self._add(f"agent-{vehicles[0]}", host)
+        host = Sleeper(self._make_host(self.scenario, names))
+        identity = Identity(Party.VEHICLE, vehicles[0])
+        self._add_agents(f"agent-{vehicles[0]}", host, identity, "named", self.scenario)
         return host
 
-    def start_shard(self, index: int = 0, count: int = 1) -> AgentHost:
-        """Start a process for all vehicles of its shard."""
-        host = self._make_host(shard=Shard(index, count))
-        self._add(f"shard-{index}", host)
+    def start_shard(
+        self, index: int = 0, count: int = 1, scenario: Scenario | None = None
+    ) -> AgentHost:
+        """Start a process for all vehicles of its shard, perhaps with a scenario of its own."""
+        scenario, shard = scenario or self.scenario, Shard(index, count)
+        host = self._make_host(scenario, shard=shard)
+        identity = Identity(Party.FLEET, shard.name)
+        self._add_agents(f"shard-{index}", host, identity, shard.name, scenario)
         return host
 
-    def _make_host(self, vehicles: Sequence[Name] = (), shard: Shard | None = None) -> AgentHost:
-        return AgentHost(
-            self._make_agent, self._new_incarnation(), self.scenario.runtime, vehicles, shard
-        )
+    def _add_agents(
+        self, name: str, core: Core, identity: Identity, drives: str, scenario: Scenario
+    ) -> None:
+        process = Process.of(identity, self._new_incarnation(), drives)
+        settings = CommonSettings.of(scenario)
+        self._add(name, CheckedCore(core, process, settings, SENSE, AGENT_GROUPS))
 
-    def _make_agent(self, vehicle: Name) -> AgentCore:
-        self.agents[vehicle] = AgentCore(vehicle, self._new_incarnation, self.scenario)
+    def _make_host(
+        self, scenario: Scenario, vehicles: Sequence[Name] = (), shard: Shard | None = None
+    ) -> AgentHost:
+        make_agent = partial(self._make_agent, scenario)
+        return AgentHost(make_agent, self._new_incarnation(), scenario.runtime, vehicles, shard)
+
+    def _make_agent(self, scenario: Scenario, vehicle: Name) -> AgentCore:
+        self.agents[vehicle] = AgentCore(vehicle, self._new_incarnation, scenario)
         return self.agents[vehicle]
 
     def _new_incarnation(self) -> int:

@@ -170,5 +170,9 @@ def _values_of(scenario: Scenario) -> Iterator[tuple[str, str]]:
 
 
 def _without_demand(table: Any) -> dict[str, Any]:  # noqa: ANN401 (tables have no common base)
-    """Return the fields of a table in a list of tables, but those of its demand."""
-    return attrs.asdict(table, recurse=False, filter=lambda one, _: one.name not in _OF_DEMAND)
+    """Return the values that a table in a list of tables sets, but those of its demand."""
+
+    def is_common(one: attrs.Attribute[Any], value: object) -> bool:
+        return one.name not in _OF_DEMAND and value is not None
+
+    return attrs.asdict(table, recurse=False, filter=is_common)
