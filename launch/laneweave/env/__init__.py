@@ -8,7 +8,8 @@
 See docs/ENVIRONMENT.md.
 """
 
+from laneweave.env.factory import parallel_env
 from laneweave.env.rewards import Rewards
-from laneweave.env.vehicles_env import VehiclesEnv, parallel_env
+from laneweave.env.vehicles_env import VehiclesEnv
 
 __all__ = ("Rewards", "VehiclesEnv", "parallel_env")
