@@ -20,6 +20,7 @@ from pettingzoo import ParallelEnv
 from laneweave.coordinator.core import CoordinatorCore
 from laneweave.coordinator.planning.rolling.requested_moves import RequestPlanner
 from laneweave.coordinator.rolling.checked_planner import Planner, checked, stream_road
+from laneweave.env.copies import dumped, loaded
 from laneweave.env.episode import Episode
 from laneweave.env.observations import OWN, Observation, Observer
 from laneweave.env.picture import Picture, road_picture
@@ -91,6 +92,22 @@ class VehiclesEnv(ParallelEnv[str, Observation, int]):
         self._refused: set[str] = set()
         self._own: dict[str, Observation] = {}
         """What each vehicle on the road observes of itself."""
+
+    def __getstate__(self) -> bytes:
+        """Return the state for `pickle` and `copy`, in an episode with all roles of the run.
+
+        Raises:
+            BadInputError: `tracking.always_solve` is set, and an episode has begun.
+        """
+        if self._episode is not None and self.scenario.tracking.always_solve:
+            allowed = "false, to copy an environment in an episode"
+            raise BadInputError("tracking.always_solve", True, allowed)
+        return dumped(self.__dict__)
+
+    def __setstate__(self, state: bytes) -> None:
+        """Restore the state."""
+        _silence_roles()
+        self.__dict__.update(loaded(state))
 
     def observation_space(self, agent: str) -> Box:
         """Return the space of observations, which all agents share."""
