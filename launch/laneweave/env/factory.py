@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal, get_args
 
 from laneweave.env.rewards import Rewards
+from laneweave.env.slots_env import SlotsEnv
 from laneweave.env.vehicles_env import VehiclesEnv
 from laneweave.protocol.config.scenario_files import load_scenario, scenario_of, to_tables
 from laneweave.protocol.errors import BadInputError, unknown_name
@@ -17,7 +18,8 @@ ROLLING: Final[Mapping[str, Any]] = {
     "runtime__coordinators": 1,
 }
 """Values of the scenario that the environment sets."""
-MAX_COLUMNS = 20
+MAX_COLUMNS, MAX_SLOTS = 20, 10_000
+Agents = Literal["vehicles", "slots"]
 
 
 def parallel_env(
@@ -26,9 +28,11 @@ def parallel_env(
     rewards: Rewards | None = None,
     columns: int = 3,
     vary_demand: bool = False,
+    agents: Agents = "vehicles",
+    slots: int | None = None,
     render_mode: str | None = None,
 ) -> VehiclesEnv:
-    """Return a PettingZoo `ParallelEnv` in which the agents are vehicles.
+    """Return a PettingZoo `ParallelEnv` in which the agents are vehicles, or slots for them.
 
     Args:
         scenario: a scenario, its file or its tables; None: the paper's road. The environment runs
@@ -38,6 +42,9 @@ def parallel_env(
         vary_demand: whether each episode draws its own vehicles. False: every episode has the
             vehicles of the scenario's seed, and the seed of `reset` changes the rest: measurement
             errors and the delays of messages.
+        agents: `vehicles`: an agent is a vehicle, from its entry until it leaves. `slots`: a fixed
+            number of agents, each of which drives one vehicle after another (`SlotsEnv`).
+        slots: number of slots, 1 to 10000; None: as many as vehicles. Only for `agents="slots"`.
         render_mode: `rgb_array`: `render` returns pictures; None: it returns None.
 
     Raises:
@@ -45,6 +52,12 @@ def parallel_env(
     """
     if not 1 <= columns <= MAX_COLUMNS:
         raise BadInputError("columns", columns, f"1 to {MAX_COLUMNS}")
+    if agents not in get_args(Agents):
+        raise unknown_name("agents", agents, get_args(Agents))
+    if slots is not None and agents != "slots":
+        raise BadInputError("slots", slots, 'None, unless agents="slots"')
+    if slots is not None and not 1 <= slots <= MAX_SLOTS:
+        raise BadInputError("slots", slots, f"1 to {MAX_SLOTS}, or None")
     modes = VehiclesEnv.metadata["render_modes"]
     if render_mode is not None and render_mode not in modes:
         raise unknown_name("render_mode", render_mode, modes)
@@ -56,5 +69,7 @@ def parallel_env(
         settings = load_scenario(None if scenario is None else Path(scenario), **ROLLING)
     if settings.sumo.config:
         raise BadInputError("sumo.config", settings.sumo.config, "none: there is no SUMO here")
-    options: dict[str, Any] = {"vary_demand": vary_demand, "render_mode": render_mode}
-    return VehiclesEnv(settings, rewards or Rewards(), columns, **options)
+    given: dict[str, Any] = {"vary_demand": vary_demand, "render_mode": render_mode}
+    if agents == "slots":
+        return SlotsEnv(settings, rewards or Rewards(), columns, slots=slots, **given)
+    return VehiclesEnv(settings, rewards or Rewards(), columns, **given)
