@@ -56,7 +56,7 @@ def parallel_env(
         raise unknown_name("agents", agents, get_args(Agents))
     if slots is not None and agents != "slots":
         raise BadInputError("slots", slots, 'None, unless agents="slots"')
-    if slots is not None and not 1 <= slots <= MAX_SLOTS:
+    if slots is not None and not (isinstance(slots, int) and 1 <= slots <= MAX_SLOTS):
         raise BadInputError("slots", slots, f"1 to {MAX_SLOTS}, or None")
     modes = VehiclesEnv.metadata["render_modes"]
     if render_mode is not None and render_mode not in modes:

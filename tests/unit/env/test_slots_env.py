@@ -195,9 +195,9 @@ def test_a_copy_of_an_environment_with_slots_continues_exactly() -> None:
 
 
 def test_bad_input() -> None:
-    for slots in (0, -1, 10_001):
+    for slots in (0, -1, 10_001, 2.5, "3"):
         with pytest.raises(BadInputError, match="slots"):
-            slots_env(slots)
+            slots_env(slots)  # type: ignore[arg-type]
     with pytest.raises(BadInputError, match="slots: got 3"):
         parallel_env(TINY, slots=3)
     with pytest.raises(BadInputError, match="did you mean slots"):
