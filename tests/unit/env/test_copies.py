@@ -131,8 +131,7 @@ def test_a_program_that_does_not_keep_its_solves_says_so() -> None:
         dumped(program)
 
 
-@HOW
-@pytest.mark.parametrize("limit_s", [12.0, 600.0])
+@pytest.mark.parametrize(("make", "limit_s"), [(copy.deepcopy, 12.0), (by_pickle, 600.0)])
 def test_a_copy_after_the_end_begins_the_same_next_episode(make: Copy, limit_s: float) -> None:
     # After 12 s vehicles are still on the road; at the other end the next plan is pending.
     env = parallel_env(TINY | {"runtime": {"max_road_s": limit_s}}, vary_demand=True)
