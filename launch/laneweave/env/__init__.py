@@ -8,7 +8,9 @@
 See docs/ENVIRONMENT.md.
 """
 
+from laneweave.env.factory import parallel_env
 from laneweave.env.rewards import Rewards
-from laneweave.env.vehicles_env import VehiclesEnv, parallel_env
+from laneweave.env.slots_env import SlotsEnv
+from laneweave.env.vehicles_env import VehiclesEnv
 
-__all__ = ("Rewards", "VehiclesEnv", "parallel_env")
+__all__ = ("Rewards", "SlotsEnv", "VehiclesEnv", "parallel_env")

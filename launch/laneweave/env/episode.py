@@ -73,7 +73,9 @@ class Episode:
             self.network.add(name, core, scenario.network.realm)
 
     def _make_agent(self, vehicle: Name) -> AgentCore:
-        make_driver = partial(TrackingDriver, stopwatch=_no_time)
+        # With `always_solve`, the bounds that a copy needs would fill the memory.
+        copyable = not self.scenario.tracking.always_solve
+        make_driver = partial(TrackingDriver, stopwatch=_no_time, copyable=copyable)
         return AgentCore(vehicle, self._incarnations.__next__, self.scenario, make_driver)
 
     @property

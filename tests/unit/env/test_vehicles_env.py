@@ -6,7 +6,7 @@ import itertools
 import subprocess
 import sys
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -21,21 +21,19 @@ from laneweave.env.record import EpisodeRecord, Trip
 from laneweave.protocol.config.scenario_files import load_scenario
 from laneweave.protocol.errors import BadInputError
 from laneweave.sim_bridge.road.demand import arrivals
+from support.environments import (
+    ROAD,
+    SHORT,
+    Chosen,
+    Policy,
+    any_move,
+    hold,
+    play,
+    same,
+)
 from support.variants import variants
 
 ROOT = Path(__file__).parents[3]
-ROAD = {"s1_m": 75.0, "s2_m": 75.0, "s3_m": 600.0}
-DENSE = {"duration_s": 20.0, "volume_veh_per_lane_h": 1800.0}
-SHORT: dict[str, Any] = {"road": ROAD, "demand": DENSE}
-"""30 vehicles; an episode takes about a second."""
-Chosen = dict[str, int]
-Policy = Callable[[VehiclesEnv, Mapping[str, Mapping[str, Any]], Generator], Chosen]
-
-
-def any_move(env: VehiclesEnv, infos: Mapping[str, Mapping[str, Any]], rng: Generator) -> Chosen:
-    """Choose among all moves, also those that the road does not allow."""
-    del infos
-    return {name: int(rng.integers(len(env.moves))) for name in env.agents}
 
 
 def into_others(env: VehiclesEnv, infos: Mapping[str, Mapping[str, Any]], rng: Generator) -> Chosen:
@@ -63,32 +61,6 @@ def into_one_lane(
         wanted = (0, int(np.sign(1 - lane))) if lane != 1 else ((1, 0), (-1, 0))[rng.integers(2)]
         chosen[name] = env.moves.index(wanted)
     return chosen
-
-
-def hold(env: VehiclesEnv, infos: Mapping[str, Mapping[str, Any]], rng: Generator) -> Chosen:
-    del infos, rng
-    return dict.fromkeys(env.agents, 0)
-
-
-def play(env: VehiclesEnv, policy: Policy, seed: int) -> list[Any]:
-    """Run an episode; return all that `reset` and `step` have returned."""
-    rng = default_rng(seed)
-    observations, infos = env.reset(seed=seed)
-    results: list[Any] = [(observations, infos)]
-    while env.agents:
-        results.append(env.step(policy(env, infos, rng)))
-        infos = results[-1][-1]
-    return results
-
-
-def same(one: object, other: object) -> bool:
-    if isinstance(one, dict) and isinstance(other, dict):
-        return list(one) == list(other) and all(same(one[key], other[key]) for key in one)
-    if isinstance(one, (list, tuple)) and isinstance(other, (list, tuple)):
-        return len(one) == len(other) and all(map(same, one, other))
-    if isinstance(one, np.ndarray):
-        return isinstance(other, np.ndarray) and np.array_equal(one, other)
-    return one == other
 
 
 @pytest.mark.parametrize(

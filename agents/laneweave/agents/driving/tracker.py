@@ -67,6 +67,8 @@ class Tracker:
         scenario: Scenario,
         limits: Vehicle,
         stopwatch: Callable[[], float] = time.thread_time,
+        *,
+        copyable: bool = False,
     ) -> None:
         """Prepare the program, and the fast path unless `tracking.always_solve` is set.
 
@@ -74,6 +76,7 @@ class Tracker:
             scenario: tick, horizon.
             limits: those of the vehicle.
             stopwatch: clock [s] that measures how long solves take.
+            copyable: see `TrackingProgram`.
         """
         self._stopwatch = stopwatch
         n = self._n = scenario.timing.horizon_ticks
@@ -86,7 +89,7 @@ class Tracker:
         kept = self._kept
         self._kept_low, self._kept_high = kept[: 10 * n].reshape(2, 5, n)
         self._kept_low_jerk, self._kept_high_jerk = kept[10 * n :].reshape(2, n, 2)
-        self.program = TrackingProgram(scenario, limits)
+        self.program = TrackingProgram(scenario, limits, copyable=copyable)
         self._regulator = None
         self.unconstrained_errors: tuple[float, ...] = ()
         """Errors up to which no constraint binds while a cell is held."""

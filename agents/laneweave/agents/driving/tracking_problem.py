@@ -156,10 +156,17 @@ class ConstraintBounds:
 class TrackingProgram:
     """The quadratic program of one vehicle; its bounds change at each tick."""
 
-    def __init__(self, scenario: Scenario, limits: Vehicle) -> None:
+    def __init__(self, scenario: Scenario, limits: Vehicle, *, copyable: bool = False) -> None:
         """Prepare the bounds; OSQP is set up on first use.
 
         Most vehicles never need OSQP, and its set-up takes as long as hundreds of ticks.
+
+        Args:
+            scenario: tick, horizon.
+            limits: those of the vehicle.
+            copyable: whether the program can be pickled after a solve. It then keeps the bounds of
+                all solves since the last cold start, which a copy repeats: OSQP's iterates cannot
+                be read.
         """
         n = self._n = scenario.timing.horizon_ticks
         self._tick_s = scenario.runtime.tick_s
@@ -175,6 +182,8 @@ class TrackingProgram:
         self._gaps = NO_GAPS
         self._qp: QuadraticProgram | None = None
         self._stale = False
+        self._solved: list[tuple[Array, Array]] | None = [] if copyable else None
+        """Bounds of the solves since the last cold start; None: not kept."""
 
     def discard_solution(self) -> None:
         """Cold-start the next solve."""
@@ -188,8 +197,39 @@ class TrackingProgram:
         if self._stale:
             qp.reset()
             self._stale = False
+            self._forget_solves()
         qp.update(self.low.all, self.high.all)
-        return qp.solve()
+        result = qp.solve()
+        if not result.usable:  # the next solve is a cold start
+            self._forget_solves()
+        elif self._solved is not None:
+            self._solved.append((self.low.all.copy(), self.high.all.copy()))
+        return result
+
+    def _forget_solves(self) -> None:
+        if self._solved is not None:
+            self._solved.clear()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the state without OSQP's.
+
+        Views of arrays must stay views (`ConstraintBounds`), as with `laneweave.env.copies`.
+
+        Raises:
+            TypeError: OSQP is set up, and the program is not copyable.
+        """
+        if self._qp is not None and self._solved is None:
+            raise TypeError("cannot pickle a TrackingProgram without copyable=True")
+        return self.__dict__ | {"_qp": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Restore the state, and OSQP's by repeating its solves."""
+        self.__dict__.update(state)
+        if self._solved and not self._stale:
+            qp = self.set_up()
+            for low, high in self._solved:
+                qp.update(low, high)
+                qp.solve()
 
     def set_up(self) -> QuadraticProgram:
         """Set up OSQP with initial bounds; results then do not depend on the time of the set-up."""

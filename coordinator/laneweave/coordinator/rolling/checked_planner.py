@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
+from functools import partial
 
 from attrs import evolve
 
@@ -35,22 +36,27 @@ and tests."""
 
 
 def checked(road: StreamRoad, planner: Planner) -> Planner:
-    """Return a planner that raises `ValueError` for invalid plans."""
+    """Return a planner that raises `ValueError` for invalid plans.
 
-    def plan(
-        slot: int,
-        vehicles: Sequence[StreamVehicle],
-        before: StreamPlan | None,
-        blocked: Collection[Cell],
-        ends_m: Mapping[int, float],
-    ) -> StreamPlan:
-        table = planner(slot, vehicles, before, blocked, ends_m)
-        problems = problems_of_plan(road.ending_at(ends_m), table, vehicles, blocked)
-        if problems:
-            raise ValueError(f"the plan of slot {slot} is invalid: {'; '.join(problems)}")
-        return table
+    It can be copied and pickled if `planner` can.
+    """
+    return partial(_checked_plan, road, planner)
 
-    return plan
+
+def _checked_plan(
+    road: StreamRoad,
+    planner: Planner,
+    slot: int,
+    vehicles: Sequence[StreamVehicle],
+    before: StreamPlan | None,
+    blocked: Collection[Cell],
+    ends_m: Mapping[int, float],
+) -> StreamPlan:
+    table = planner(slot, vehicles, before, blocked, ends_m)
+    problems = problems_of_plan(road.ending_at(ends_m), table, vehicles, blocked)
+    if problems:
+        raise ValueError(f"the plan of slot {slot} is invalid: {'; '.join(problems)}")
+    return table
 
 
 def stream_planner(scenario: Scenario) -> Planner:

@@ -24,7 +24,7 @@ from laneweave.coordinator.rolling.observed import ObservedRoad
 from laneweave.coordinator.rolling.ownership import certain_cells, partners
 from laneweave.coordinator.rolling.transfer import TRANSFER_RULES, CellTransfer
 from laneweave.protocol.lattice import footprint
-from laneweave.protocol.runtime.node import Compute, Computed, Effect
+from laneweave.protocol.runtime.node import Clock, Compute, Computed, Effect
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.formation_table import SNAPSHOT_S
 from laneweave.protocol.state_machine import RuleBook
@@ -176,7 +176,7 @@ class RollingOperation:
         plan = partial(
             self._planner, slot + 1, vehicles, self._last_plan, blocked, known.section_ends_m()
         )
-        yield Compute(job, lambda _: plan())
+        yield Compute(job, partial(_without_deadline, plan))
 
     def finish(self, computed: Computed, t_s: float, now_s: float) -> Iterator[LogEntry]:
         """Begin ballots for the first moves of the plan requested last; ignore other results."""
@@ -265,6 +265,12 @@ class RollingOperation:
     def in_force(self) -> int:
         """Number of ballots for this slot that are in force."""
         return sum(transfer.phase is BallotPhase.IN_FORCE for transfer in self.transfers)
+
+
+def _without_deadline(plan: Callable[[], StreamPlan], clock: Clock) -> StreamPlan:
+    """Run a planner that needs no clock; unlike a closure, a pending job can be copied."""
+    del clock
+    return plan()
 
 
 def _clusters(groups: Iterable[set[Name]]) -> list[set[Name]]:

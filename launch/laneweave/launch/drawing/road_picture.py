@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, Final
 
-from laneweave.launch.drawing.colours import CLOSED_FILL, CLOSED_HATCH
+from laneweave.launch.drawing.colours import CLOSED_FILL, CLOSED_HATCH, exit_in_words
 from laneweave.launch.drawing.figures import INK
+from laneweave.launch.drawing.road_scene import closed_parts, ramp_edges
+from laneweave.protocol.scenario.fields import Scenario
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -45,6 +47,35 @@ def draw_lanes(
     axes.tick_params(axis="x", bottom=False, labelbottom=False)
     axes.spines[:].set_visible(False)
     axes.grid(visible=False)
+
+
+def draw_closed_parts(axes: Axes, scenario: Scenario) -> None:
+    """Draw closed parts with hatching, the stop lines before them, ramps and exits."""
+    from matplotlib.patches import Rectangle  # noqa: PLC0415 - lazily
+
+    width_m = scenario.road.lane_width_m
+    for part in closed_parts(scenario):
+        corner, length_m = (part.from_m, part.lane * width_m), part.to_m - part.from_m
+        axes.add_patch(Rectangle(corner, length_m, width_m, zorder=1.5, **CLOSED))
+        if part.line_m is not None:
+            lane_m = (corner[1], corner[1] + width_m)
+            axes.plot([part.line_m] * 2, lane_m, color=INK, linewidth=1.6, zorder=2)
+    for lane, from_m, to_m in ramp_edges(scenario):
+        axes.plot([from_m, to_m], [lane * width_m] * 2, color=INK, linewidth=1.6, zorder=2)
+    for one in scenario.exit:
+        for lane in one.lanes:
+            # Beside the road, where it hides no vehicle.
+            below = lane < scenario.road.lanes / 2
+            y_m = -0.4 if below else scenario.road.lanes * width_m + 0.35
+            axes.text(
+                one.at_m,
+                y_m,
+                f"{exit_in_words(one.name)} →",
+                ha="right",
+                va="top" if below else "bottom",
+                fontsize=8,
+                clip_on=True,
+            )
 
 
 def draw_position_axis(axes: Axes, note: str = "") -> None:

@@ -11,7 +11,6 @@ import numpy as np
 from laneweave.launch.drawing.colours import (
     SHADE_STRENGTH,
     SPEED_SPAN_MPS,
-    exit_in_words,
     has_preferences,
     sorting_start,
     text_colour,
@@ -23,6 +22,7 @@ from laneweave.launch.drawing.figures import DPI, FAINT_INK, INK
 from laneweave.launch.drawing.road_picture import (
     CLOSED,
     draw_body,
+    draw_closed_parts,
     draw_lanes,
     draw_position_axis,
     write_time,
@@ -192,39 +192,10 @@ def _draw_road(axes: Axes, scenario: Scenario, stretch_m: tuple[float, float]) -
     road, space = scenario.road, {"below_m": _below_m(scenario), "above_m": _ABOVE_M}
     width_m = road.lanes * road.lane_width_m
     draw_lanes(axes, road.lanes, road.lane_width_m, stretch_m, **space)
-    _draw_closed_parts(axes, scenario)
+    draw_closed_parts(axes, scenario)
     if stretch_m[0] < scenario.geometry.moves_from_m < stretch_m[1]:
         place = ([scenario.geometry.moves_from_m] * 2, [0.0, width_m])
         axes.plot(*place, color=INK, linewidth=1.0, linestyle=":", zorder=2)
-
-
-def _draw_closed_parts(axes: Axes, scenario: Scenario) -> None:
-    """Draw closed parts with hatching, the stop lines before them, ramps and exits."""
-    from matplotlib.patches import Rectangle  # noqa: PLC0415 - lazily
-
-    width_m = scenario.road.lane_width_m
-    for part in closed_parts(scenario):
-        corner, length_m = (part.from_m, part.lane * width_m), part.to_m - part.from_m
-        axes.add_patch(Rectangle(corner, length_m, width_m, zorder=1.5, **CLOSED))
-        if part.line_m is not None:
-            lane_m = (corner[1], corner[1] + width_m)
-            axes.plot([part.line_m] * 2, lane_m, color=INK, linewidth=1.6, zorder=2)
-    for lane, from_m, to_m in ramp_edges(scenario):
-        axes.plot([from_m, to_m], [lane * width_m] * 2, color=INK, linewidth=1.6, zorder=2)
-    for one in scenario.exit:
-        for lane in one.lanes:
-            # Beside the road, where it hides no vehicle.
-            below = lane < scenario.road.lanes / 2
-            y_m = -0.4 if below else scenario.road.lanes * width_m + 0.35
-            axes.text(
-                one.at_m,
-                y_m,
-                f"{exit_in_words(one.name)} →",
-                ha="right",
-                va="top" if below else "bottom",
-                fontsize=8,
-                clip_on=True,
-            )
 
 
 def _draw_formations(
