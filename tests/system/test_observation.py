@@ -8,12 +8,15 @@ import signal
 import socket
 import urllib.request
 from pathlib import Path
+from typing import Any
 
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from laneweave.launch.cli.status_command import listen
-from laneweave.launch.observe.status import BRIDGE, COORDINATOR, RoleHealth, Status
+from laneweave.launch.observe.observed import BRIDGE, COORDINATOR, Expected
+from laneweave.launch.observe.process_view import label_of
+from laneweave.launch.observe.status import Status
 from laneweave.protocol.config.scenario_files import load_scenario
 from support.deployments import deployment, free_tcp, ping, start_router, stop
 from support.harness import END_S, Ended, Lab
@@ -39,9 +42,9 @@ def wait_for_health(lab: Lab, config: Path, *options: str) -> Ended:
     return looks[-1]
 
 
-def seen(config: Path, role: RoleHealth | None = None) -> Status:
+def seen(config: Path, process: str | None = None, **expected: Any) -> Status:  # noqa: ANN401
     """Return what the command would print, without the start of a process."""
-    return listen(load_scenario(config), float(LOOK_S), role)
+    return listen(load_scenario(config), float(LOOK_S), Expected(**expected), process)
 
 
 def metrics(address: str) -> dict[str, float]:
@@ -68,7 +71,7 @@ def names(found: dict[str, float]) -> set[str]:
 @pytest.mark.more
 def test_status_of_a_deployment(lab: Lab) -> None:
     # Longer than the test takes; and c1 leads until it is killed, even on a busy machine.
-    config = deployment(lab, free_tcp(), "election_s = 3.0\n")
+    config = deployment(lab, free_tcp(), "election_s = 3.0\n\n[runtime]\ncoordinators = 2\n")
     text = config.read_text("utf-8").replace("duration_s = 14.0", "duration_s = 900.0")
     config.write_text(text, encoding="utf-8")
     nobody = status(lab, config)
@@ -80,12 +83,14 @@ def test_status_of_a_deployment(lab: Lab) -> None:
     first = lab.start("coordinator", "--config", config, "--name", "c1")
     second = lab.start("coordinator", "--config", config, "--name", "c2")
     shards = [lab.start("agent", "--config", config, "--shard", f"{i}/2") for i in range(2)]
-    lab.wait_until(lambda: seen(config, RoleHealth(COORDINATOR, "c2")).healthy, END_S)
+    lab.wait_until(
+        lambda: seen(config, label_of(COORDINATOR, "c2"), coordinators=("c2",)).healthy, END_S
+    )
     lab.wait_until(lambda: seen(config).leader == "c1", END_S)
     bridge = lab.start("bridge", "--config", config, "--pace", "5", "--out", "out")
     ended = status(lab, config, "--role", "coordinator", "--name", "c3")
     assert (ended.status, ended.out) == (1, "")
-    assert ended.complaints == ["not healthy: no coordinator c3 found"]
+    assert ended.complaints == ["not healthy: no coordinator c3 found: start it"]
 
     def flows(found: Status) -> bool:
         """Tell whether c1 leads and the road advances."""
@@ -100,7 +105,7 @@ def test_status_of_a_deployment(lab: Lab) -> None:
         )
 
     lab.wait_until(lambda: flows(seen(config)), END_S)
-    lab.wait_until(lambda: seen(config, RoleHealth(BRIDGE)).healthy, END_S)
+    lab.wait_until(lambda: seen(config, BRIDGE, bridge=True).healthy, END_S)
     table = wait_for_health(lab, config)
     assert table.complaints == []
     for row in (
@@ -125,7 +130,9 @@ def test_status_of_a_deployment(lab: Lab) -> None:
     found_there = json.loads(other.out)
     assert (found_there["schema"], found_there["realm"]) == ("laneweave.status/1", "other")
     assert (found_there["candidates"], found_there["road"]) == ([], None)
-    assert other.complaints == [f"not healthy: {found_there['problem']}"]
+    problems = [f"not healthy: {one['what']}: {one['advice']}" for one in found_there["findings"]]
+    assert other.complaints == problems
+    assert problems[0].startswith(f"not healthy: {found_there['problem']}")
 
     bridge.send_signal(signal.SIGTERM)
     assert lab.finish(bridge, END_S).status == 0

@@ -6,6 +6,7 @@ import json
 import signal
 import subprocess
 import time
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -58,6 +59,14 @@ def errors_of(log: Path) -> list[dict[str, object]]:
     return [entry for entry in entries if entry["level"] == "error"]
 
 
+def has_started(log: Path) -> bool:
+    return '"starting"' in log.read_text(encoding="utf-8")
+
+
+def has_refused(log: Path) -> bool:
+    return bool(errors_of(log))
+
+
 def start_logged(lab: Lab, log: Path, *arguments: object) -> subprocess.Popen[str]:
     """Start a role whose log goes to a file."""
     with log.open("w", encoding="utf-8") as stream:
@@ -82,9 +91,9 @@ def test_a_role_that_does_not_fit_says_so_and_does_not_act(lab: Lab) -> None:
         # A lower name than that of the coordinator in charge: it would lead if it fitted.
         named = ("coordinator", "--name", "c0") if role == "coordinator" else ("agent",)
         process = start_logged(lab, log, *named, "--config", other)
-        lab.wait_until(lambda log=log: '"starting"' in log.read_text(encoding="utf-8"), END_S)
+        lab.wait_until(partial(has_started, log), END_S)
         began_s = time.monotonic()
-        lab.wait_until(lambda log=log: bool(errors_of(log)), END_S)
+        lab.wait_until(partial(has_refused, log), END_S)
         took_s = time.monotonic() - began_s
         (error,) = errors_of(log)
         # From the first line of its log on, which it writes before it connects; the bridge
@@ -122,7 +131,7 @@ def test_vehicles_of_a_fleet_that_does_not_fit_are_driven_around(lab: Lab) -> No
     log = lab.folder / "other.log"
     misfit = start_logged(lab, log, "agent", "--config", other, "--shard", "1/2")
     bridge = lab.start("bridge", "--config", config, "--pace", "5", "--out", "out")
-    lab.wait_until(lambda: bool(errors_of(log)), END_S)
+    lab.wait_until(partial(has_refused, log), END_S)
     ended = lab.finish(bridge, RUN_S)
     assert ended.status == 0, ended
     misfit.send_signal(signal.SIGTERM)

@@ -50,6 +50,7 @@ class EpisodeRecord:
         self.planning_errors: list[str] = []
         """Errors of plans that could not be made."""
         self.missed_ticks = 0
+        self.recording = True
         self.ending: Ending | None = None
         """How the episode has ended; None: it goes on."""
         self._exits = Exits(scenario.geometry.sections, scenario.road.length_m)
@@ -60,6 +61,11 @@ class EpisodeRecord:
         """Count an event from the bridge."""
         del t_s, data
         self.events[kind] += 1
+
+    @property
+    def overlap_count(self) -> int:
+        """Number of pairs of bodies that have intersected."""
+        return len({frozenset(pair) for _, *pair in self.overlaps})
 
     def on_demanded(self, arrival: Arrival) -> None:
         """Do nothing: the trip begins when the vehicle enters."""

@@ -38,7 +38,7 @@ from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.summary import Ending
 from laneweave.protocol.wire.events import AGENT_MISSING
 from laneweave.protocol.wire.messages import Command, Heartbeat, Name, Plan, Prepare
-from laneweave.protocol.wire.process_messages import LogEvent, Report
+from laneweave.protocol.wire.process_messages import LogEvent, Report, RoadStatus
 from laneweave.protocol.wire.topics import (
     CENSUS,
     EVENT,
@@ -166,6 +166,7 @@ class BridgeCore:
         self._scenario = scenario
         self._world = world
         self._record = record
+        self._new_incarnation = new_incarnation
         self._roadside = Roadside(scenario, stream, incarnation, outside_traffic)
         self.road = SimulatedRoad(
             scenario, self._roadside, record, new_incarnation, RoadVehicle.entering, incarnation
@@ -200,7 +201,7 @@ class BridgeCore:
                 vehicles_entered_total=clock.entered,
                 vehicles_left_total=clock.left,
                 vehicles_on_road=clock.on_road,
-                vehicles_unattended=self.road.caretakers.caretaker_count,
+                vehicles_unattended=len(self.road.caretakers.vehicles),
             ),
         )
 
@@ -245,8 +246,24 @@ class BridgeCore:
         if self.phase is not TickPhase.ANSWERS or self._answers.complete(now_s):
             effects += self._proceed(now_s)
         if now_s >= self._deployment.wakeup_s and self.phase is not TickPhase.ENDED:
-            effects += self._deployment.publish(now_s)
+            effects += self._deployment.publish(now_s, self._status(now_s))
         return effects
+
+    def _status(self, now_s: float) -> RoadStatus:
+        """Return what observers learn about the road, but for the time without agents."""
+        waits = self.phase is TickPhase.AGENTS
+        up = self._answers.up
+        return RoadStatus(
+            bridge=self.road.incarnation,
+            clock_s=self._new_incarnation() / 1e9,
+            standing_s=now_s - self._opened_s if waits else 0.0,
+            awaited=tuple(
+                one.name for one in self.road.at_entrance if waits and one.name not in up
+            ),
+            unattended=dict.fromkeys(self.road.caretakers.vehicles, 0.0),
+            overlaps=self._record.overlap_count,
+            recording=self._record.recording,
+        )
 
     def _on_event(self, event: Event, now_s: float) -> Iterator[Effect]:
         self.road.caretakers.on_network(event, now_s)

@@ -13,7 +13,7 @@ from rich.table import Table
 
 from laneweave.protocol.config.participants import named_identities
 from laneweave.protocol.config.scenario_files import load_scenario
-from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.errors import BadInputError, Described
 from laneweave.protocol.field_validators import host_of
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.wire.identities import Identity, parse_identity
@@ -137,8 +137,19 @@ def check(
         Party | None, typer.Option("--role", help="Also check the certificate of this role.")
     ] = None,
     name: Annotated[str, typer.Option("--name", metavar="NAME", help="Name of the role.")] = "",
+    against: Annotated[
+        str | None,
+        typer.Option(
+            "--against",
+            metavar="REALM",
+            help="Also compare the file with the settings of the bridge in this realm.",
+        ),
+    ] = None,
 ) -> None:
-    """Check a configuration and, with --role, that role's certificate files on this host."""
+    """Check a configuration and, with --role, that role's certificate files on this host.
+
+    With --against, exit with status 2 if roles with this file would not act on the bridge's road.
+    """
     from laneweave.launch.deploy.config_check import check_deployment
     from laneweave.protocol.config.source_files import read_toml_source
     from laneweave.protocol.errors import raise_all
@@ -157,4 +168,35 @@ def check(
     table = Table("what", escape(str(file)), show_lines=False)
     for what, value in report.facts:
         table.add_row(what, escape(value))
+    if against is not None:
+        compared = _compare(settings, against, role)
+        table.add_row("road", f"{compared} settings are those of the bridge in realm {against}")
     Console().print(table)
+
+
+def _compare(settings: Scenario, realm: str, role: Party | None) -> int:
+    """Compare the settings that all roles share with those of a bridge; return their number.
+
+    Raises:
+        BadInputError: some differ, or there is no router at the endpoint.
+        CommandFailedError: there is no bridge.
+    """
+    import attrs
+
+    from laneweave.launch.observe.bridge_lookup import settings_of_bridge
+    from laneweave.protocol.errors import CommandFailedError, raise_all
+    from laneweave.protocol.scenario.common_settings import AGENT_GROUPS, GROUPS, CommonSettings
+    from laneweave.protocol.security.access_control import access_of
+
+    network = attrs.evolve(settings.network, realm=realm)
+    access = access_of(attrs.evolve(settings, network=network), "observer.status")
+    bridge = settings_of_bridge(access)
+    if bridge is None:
+        raise CommandFailedError(f"no bridge found in realm {realm} at {access.endpoint}")
+    groups = AGENT_GROUPS if role in (Party.VEHICLE, Party.FLEET) else tuple(GROUPS)
+    own = CommonSettings.of(settings)
+    raise_all(
+        BadInputError(one.name, Described(one.own), f"{one.other}, as the bridge in realm {realm}")
+        for one in own.differences(bridge.values, groups)
+    )
+    return len(own.values)

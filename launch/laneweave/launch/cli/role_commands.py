@@ -134,22 +134,27 @@ def bridge(
     endpoint: Endpoint = None,
     out: RunFolder = None,
     pace: Annotated[float | None, typer.Option("--pace", help="Road seconds per second.")] = 1.0,
+    takeover: Annotated[
+        bool,
+        typer.Option("--takeover", help="Start even if another bridge drives a road in the realm."),
+    ] = False,
     metrics: Metrics = None,
     log_format: Log = LogFormat.text,
     log_level: Level = None,
 ) -> None:
     """Run the simulated world of a deployment."""
+    from laneweave.launch.observe.bridge_lookup import refuse_second_bridge
     from laneweave.launch.report.report import draw_report
     from laneweave.launch.run.outcome import complete_summary, print_outcome
     from laneweave.sim_bridge.process import run_bridge
 
     check_pace(pace, "--pace")
     settings = load_deployment(config, endpoint, observation__metrics=metrics)
-    with (
-        _as_role("bridge", "bridge", settings, log_format, log_level) as observe,
-        new_folder(out, settings, FORMATION) as folder,
-    ):
-        run_bridge(settings, folder, FORMATION, pace, observe=observe)
+    with _as_role("bridge", "bridge", settings, log_format, log_level) as observe:
+        if not takeover:
+            refuse_second_bridge(access_of(settings, "bridge"))
+        with new_folder(out, settings, FORMATION) as folder:
+            run_bridge(settings, folder, FORMATION, pace, observe=observe)
     outcome = complete_summary(folder, problems=(), interrupted=stop_signal_received())
     print_outcome(outcome, Console())
     if outcome.has_traffic:

@@ -16,18 +16,12 @@ from rich.markup import escape
 from rich.table import Table
 
 from laneweave.launch.cli.options import Config, Endpoint, load_deployment
+from laneweave.launch.observe.findings import Findings
+from laneweave.launch.observe.observed import AGENT, BRIDGE, COORDINATOR, FLEET, Expected
 from laneweave.launch.observe.observer import Observer
-from laneweave.launch.observe.road_view import Coordinator
-from laneweave.launch.observe.status import (
-    AGENT,
-    BRIDGE,
-    COORDINATOR,
-    LISTENED,
-    TOKENS,
-    RoleHealth,
-    Status,
-    status_of,
-)
+from laneweave.launch.observe.process_view import label_of
+from laneweave.launch.observe.road_view import Coordinator, RoadView
+from laneweave.launch.observe.status import LISTENED, TOKENS, Status, status_of
 from laneweave.protocol.errors import BadInputError, CommandFailedError
 from laneweave.protocol.names import NAME_PATTERN, NAME_RULE
 from laneweave.protocol.scenario.deployment_fields import parse_shard
@@ -62,42 +56,67 @@ def status(
     shard: Annotated[
         str | None, typer.Option("--shard", metavar="I/N", help="Shard of the agents.")
     ] = None,
+    no_bridge: Annotated[
+        bool,
+        typer.Option(
+            "--no-bridge", help="No road need be there: before its start, or a service alone."
+        ),
+    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
     """Listen to a deployment and print its state; exit with status 1 if it is unhealthy."""
     settings = load_deployment(config, endpoint, network__realm=realm)
-    health = _role_health(role, name, shard)
-    found = listen(settings, seconds, health)
+    process, expected = _expected(settings, role, name, shard, bridge=not no_bridge)
+    if process is None and config is None:
+        expected = evolve(expected, coordinators=())  # a default names none
+    found = listen(settings, seconds, expected, process)
     if as_json:
         typer.echo(json.dumps(found.to_dict(), indent=2))
-    elif health is None:
+    elif process is None:
         show(found, Console())
     elif found.healthy:
         typer.echo("healthy")
-    if found.problem is not None:
-        raise CommandFailedError(f"not healthy: {found.problem}")
+    if found.findings:
+        raise CommandFailedError("\n".join(f"not healthy: {finding}" for finding in found.findings))
 
 
-def _role_health(role: Role | None, name: str | None, shard: str | None) -> RoleHealth | None:
+def _expected(
+    settings: Scenario, role: Role | None, name: str | None, shard: str | None, *, bridge: bool
+) -> tuple[str | None, Expected]:
+    """Return the process to check, if it is only one, and what should be there."""
     if shard is not None:
         if role is not Role.agent or name is not None:
             raise BadInputError("--shard", shard, "only with --role agent and without --name")
-        return RoleHealth(AGENT, shard, parse_shard(shard, "--shard").contains)
+        part = parse_shard(shard, "--shard")
+        fleets = Expected.of(settings, bridge=False).fleets
+        fleet = next((one for one, members in fleets.items() if members == part), part.name)
+        return label_of(FLEET, fleet), Expected(fleets={fleet: part})
     if name is not None and (role in (None, Role.bridge) or not NAME_PATTERN.fullmatch(name)):
         raise BadInputError("--name", name, f"only with --role coordinator or agent: {NAME_RULE}")
     if name is None and role in (Role.coordinator, Role.agent):
         also = ", or --shard I/N" if role is Role.agent else ""
         raise BadInputError("--name", "", f"the name of the process to check{also}")
-    return None if role is None else RoleHealth(role.value, name or "")
+    match role:
+        case Role.coordinator:
+            return label_of(COORDINATOR, name or ""), Expected(coordinators=(name or "",))
+        case Role.agent:
+            return label_of(AGENT, name or ""), Expected(vehicles=(name or "",))
+        case Role.bridge:
+            return BRIDGE, Expected(bridge=True)
+        case None:
+            return None, Expected.of(settings, bridge=bridge)
 
 
-def listen(settings: Scenario, seconds: float, health: RoleHealth | None = None) -> Status:
+def listen(
+    settings: Scenario, seconds: float, expected: Expected, process: str | None = None
+) -> Status:
     """Listen to a deployment and return its status.
 
     Args:
         settings: the deployment.
-        seconds: listening time; a health check of one process stops once it succeeds.
-        health: check of one process; None: check the whole deployment.
+        seconds: listening time; a check of one process stops once nothing is wrong with it.
+        expected: what should be there.
+        process: role and name of the only process to check; None: all.
 
     Raises:
         BadInputError: there is no router at the endpoint.
@@ -107,14 +126,10 @@ def listen(settings: Scenario, seconds: float, health: RoleHealth | None = None)
     network = settings.network
     observer = Observer(Keys(network.realm), topics=LISTENED, tokens=TOKENS)
     access, view = access_of(settings, "observer.status"), observer.view
-
-    def problem() -> str | None:
-        assert health is not None  # noqa: S101 (called only then)
-        return health.problem(view, began_s, now_s, network.election_s)
-
     with contextlib.closing(ZenohTransport(access, observer.inbox.put)) as transport:
         began_s = now_s = time.monotonic()
         end_s = began_s + seconds
+        findings = Findings(expected, began_s, network.election_s, process)
         observer.subscribe(transport)
         while now_s < end_s:
             for event in observer.receive(min(WAIT_S, end_s - now_s)):
@@ -123,13 +138,21 @@ def listen(settings: Scenario, seconds: float, health: RoleHealth | None = None)
                 if now_s >= end_s:
                     break  # a flood of messages must not extend the time
             now_s = time.monotonic()
-            if health is not None and health.may_end_early(view) and problem() is None:
+            found = findings.look(view, now_s, time.time(), last=True)
+            if process is not None and not found and _suffices(process, view):
                 break
-    found = status_of(view, began_s, now_s, network.election_s, network.endpoint, network.realm)
-    if health is None:
-        return found
-    reason = problem()
-    return evolve(found, healthy=reason is None, problem=reason)
+    found = findings.look(view, now_s, time.time(), last=True)
+    return status_of(
+        view, found, began_s, now_s, network.election_s, network.endpoint, network.realm
+    )
+
+
+def _suffices(process: str, view: RoadView) -> bool:
+    """Return whether what was received suffices to conclude that a process is healthy."""
+    if not process.startswith(FLEET):
+        return True
+    # The bridge says which vehicles have no agents.
+    return bool(view.processes.road_statuses) or (view.census is not None and bool(view.states))
 
 
 def show(found: Status, console: Console) -> None:
@@ -143,6 +166,8 @@ def show(found: Status, console: Console) -> None:
 def _rows(found: Status) -> Iterator[tuple[str, str]]:
     """Yield names and values; what was not seen has no row."""
     yield "health", "healthy" if found.healthy else "not healthy"
+    for finding in found.findings:
+        yield finding.process, finding.what
     yield "realm", found.realm
     yield "endpoint", found.endpoint
     yield "listened", f"{found.listened_s:.1f} s"

@@ -5,10 +5,11 @@ from __future__ import annotations
 import contextlib
 import queue
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 from attrs import define, field
 
+from laneweave.launch.observe.process_view import OtherVersion
 from laneweave.launch.observe.road_view import NetworkEvent, RoadView
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.runtime.node import PeerDown, PeerUp, known_key, read_message
@@ -66,7 +67,11 @@ class Observer:
             case Received(key, payload):
                 known = self.keys.read(key)
                 if known is not None and known[0] in self.topics:
-                    yield read_message(self.keys, key, payload)
+                    try:
+                        yield read_message(self.keys, key, payload)
+                    except BadInputError as error:
+                        if error.field == "version":
+                            yield OtherVersion(_sender(*known), error.value)
             case TokenUp(key):
                 yield PeerUp(*known_key(self.keys, key))
             case TokenDown(key):
@@ -75,3 +80,10 @@ class Observer:
                 yield delivery
             case _:
                 pass
+
+
+def _sender(topic: Topic, parameters: Mapping[str, str]) -> str:
+    """Return role and name of a message's sender, as far as its key tells."""
+    role = parameters.get("role", topic.sender)
+    name = parameters.get("name") or parameters.get(topic.sender, "")
+    return f"{role} {name}".rstrip()

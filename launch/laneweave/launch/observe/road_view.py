@@ -12,6 +12,7 @@ from typing import Any
 
 from attrs import define, field, frozen
 
+from laneweave.launch.observe.process_view import OtherVersion, ProcessView
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.runtime.node import Arrived, PeerDown, PeerUp
 from laneweave.protocol.runtime.transport import LinkDown, LinkUp
@@ -27,7 +28,7 @@ from laneweave.protocol.wire.topics import (
     incarnation_of,
 )
 
-NetworkEvent = Arrived | PeerUp | PeerDown | LinkUp | LinkDown
+NetworkEvent = Arrived | PeerUp | PeerDown | LinkUp | LinkDown | OtherVersion
 
 MAX_EVENTS = 1000
 """Maximum number of log events kept for `take_events`."""
@@ -108,6 +109,7 @@ class RoadView:
     """Vehicles whose agents have tokens."""
     bridge_tokens: set[int] = field(factory=set)
     """Incarnations of the bridges with tokens."""
+    processes: ProcessView = field(factory=ProcessView)
     _events: deque[LogEvent] = field(factory=lambda: deque(maxlen=MAX_EVENTS))
 
     @property
@@ -122,6 +124,7 @@ class RoadView:
             event: message or event.
             now_s: time of arrival on the clock of the observer.
         """
+        self.processes.update(event, now_s)
         match event:
             case Arrived(topic, _, message):
                 self.message_counts[topic.name] += 1
@@ -183,6 +186,14 @@ class RoadView:
                 )
             )
         return found
+
+    def candidates(self, now_s: float, election_s: float) -> list[Coordinator]:
+        """Return the coordinators with a token or a recent heartbeat; see `coordinators`."""
+        return [
+            one
+            for one in self.coordinators(now_s, election_s)
+            if one.token or one.is_active(election_s)
+        ]
 
     @property
     def bridge(self) -> int:

@@ -1,18 +1,19 @@
-"""State of a deployment, and health checks of the deployment and of individual processes."""
+"""State of a deployment, as `laneweave status` prints it; `findings` says what is wrong."""
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Callable
+from collections.abc import Sequence
 from typing import Any
 
 import attrs
 from attrs import frozen
 
+from laneweave.launch.observe.findings import Finding
 from laneweave.launch.observe.road_view import Coordinator, RoadView, claims_of
 from laneweave.protocol.wire.topics import (
     BRIDGE_ALIVE,
     COORDINATOR_ALIVE,
+    PROCESS_ALIVE,
     TOPICS,
     VEHICLE_ALIVE,
     Quality,
@@ -23,9 +24,7 @@ LISTENED = tuple(
     topic for topic in TOPICS if topic.kind is not None and topic.quality is Quality.LATEST
 )
 """Topics whose publishers do not wait for slow subscribers, so the observer cannot delay them."""
-TOKENS = (COORDINATOR_ALIVE, VEHICLE_ALIVE, BRIDGE_ALIVE)
-
-COORDINATOR, BRIDGE, AGENT = "coordinator", "bridge", "agent"
+TOKENS = (COORDINATOR_ALIVE, VEHICLE_ALIVE, BRIDGE_ALIVE, PROCESS_ALIVE)
 
 
 @frozen
@@ -78,7 +77,9 @@ class Status:
 
     healthy: bool
     problem: str | None
-    """Why the deployment is unhealthy; None: it is healthy."""
+    """The gravest finding; None: the deployment is healthy."""
+    findings: tuple[Finding, ...]
+    """All findings."""
     endpoint: str
     realm: str
     listened_s: float
@@ -101,6 +102,7 @@ class Status:
 
 def status_of(
     view: RoadView,
+    findings: Sequence[Finding],
     began_s: float,
     now_s: float,
     election_s: float,
@@ -111,24 +113,21 @@ def status_of(
 
     Args:
         view: observed state.
+        findings: what is wrong, the gravest first.
         began_s: when observation began, on the clock of the observer.
         now_s: current time on this clock.
         election_s: time without a heartbeat after which a coordinator no longer leads.
         endpoint: endpoint of the router.
         realm: realm of the deployment.
     """
-    candidates = [
-        one
-        for one in view.coordinators(now_s, election_s)
-        if one.token or one.is_active(election_s)
-    ]
+    candidates = view.candidates(now_s, election_s)
     claims = claims_of(candidates)
     leader = claims[0] if claims else None
     listened_s = now_s - began_s
-    problem = _problem(view, candidates, leader, listened_s, election_s)
     return Status(
-        healthy=problem is None,
-        problem=problem,
+        healthy=not findings,
+        problem=findings[0].what if findings else None,
+        findings=tuple(findings),
         endpoint=endpoint,
         realm=realm,
         listened_s=round(listened_s, 3),
@@ -144,107 +143,6 @@ def status_of(
             for topic, count in sorted(view.message_counts.items())
         },
     )
-
-
-@frozen
-class RoleHealth:
-    """Health check of a process or of the agents of a shard."""
-
-    role: str
-    """`COORDINATOR`, `BRIDGE` or `AGENT`."""
-    name: str = ""
-    """Name of the coordinator, the vehicle or the shard."""
-    in_shard: Callable[[str], bool] | None = None
-    """Returns whether a vehicle belongs to the shard; None: not the check of a shard."""
-
-    def problem(
-        self, view: RoadView, began_s: float, now_s: float, election_s: float
-    ) -> str | None:
-        """Return a description of the problem, or None; arguments as in `status_of`."""
-        if not view.linked:
-            return LINK_LOST
-        if self.role == COORDINATOR:
-            return self._coordinator_problem(view, now_s, election_s)
-        if self.role == BRIDGE:
-            if not view.bridge_tokens:
-                return "no bridge found"
-            return _road_problem(view, now_s - began_s)
-        if self.in_shard is not None:
-            return self._shard_problem(view, self.in_shard)
-        return None if self.name in view.agent_tokens else f"no agent of {self.name} found"
-
-    def may_end_early(self, view: RoadView) -> bool:
-        """Return whether the observed state suffices to conclude that there is no problem."""
-        return self.in_shard is None or view.census is not None
-
-    def _coordinator_problem(self, view: RoadView, now_s: float, election_s: float) -> str | None:
-        found = [
-            one
-            for one in view.coordinators(now_s, election_s)
-            if one.token and one.coordinator == self.name
-        ]
-        if not found:
-            return f"no coordinator {self.name} found"
-        if any(one.is_active(election_s) for one in found):
-            return None
-        return f"no heartbeat of coordinator {self.name} for {election_s:g} s"
-
-    def _shard_problem(self, view: RoadView, in_shard: Callable[[str], bool]) -> str | None:
-        """Return the problem of a shard; a shard without vehicles on the road is healthy."""
-        unattended = [
-            entry.vehicle
-            for entry in (view.census.on_road if view.census is not None else ())
-            if in_shard(entry.vehicle)
-            and (
-                entry.vehicle not in view.agent_tokens
-                or (entry.vehicle in view.states and not view.states[entry.vehicle].attended)
-            )
-        ]
-        if not unattended:
-            return None
-        count = len(unattended)
-        vehicles = "1 vehicle" if count == 1 else f"{count} vehicles"
-        return f"shard {self.name}: {vehicles} without an agent, such as {unattended[0]}"
-
-
-LINK_LOST = "the connection to the router was lost"
-
-
-def _problem(
-    view: RoadView,
-    candidates: list[Coordinator],
-    leader: Coordinator | None,
-    listened_s: float,
-    election_s: float,
-) -> str | None:
-    if not view.linked:
-        return LINK_LOST
-    if leader is None:
-        count = len(candidates)
-        found = "one coordinator" if count == 1 else f"{count or 'no'} coordinators"
-        return f"there is no leader: {found} found"
-    # The token of a killed process may persist, so only processes with heartbeats count.
-    active = Counter(one.coordinator for one in candidates if one.is_active(election_s))
-    for name, processes in active.items():
-        if processes > 1:
-            return f"{processes} coordinators have the name {name}, which must be unique"
-    return _road_problem(view, listened_s)
-
-
-def _road_problem(view: RoadView, listened_s: float) -> str | None:
-    """Return the problem of the road; None if there is no problem or no road."""
-    first, newest = view.first_clock, view.clock
-    if first is None or newest is None:
-        if view.bridge_tokens:
-            return f"no clock of the bridge for {listened_s:.1f} s"
-        return None
-    if newest.ended:
-        return None
-    if newest.tick == first.tick:
-        return f"the road clock has not advanced beyond {newest.t_s:.1f} s for {listened_s:.1f} s"
-    if not view.bridge_tokens:
-        return f"the bridge disappeared at {newest.t_s:.1f} s, before the end of its road"
-    return None
 
 
 def _plans(view: RoadView, leader: Coordinator | None) -> Plans:

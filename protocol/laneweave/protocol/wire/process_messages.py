@@ -29,6 +29,29 @@ class ProcessSettings(Message, frozen=True):
     """Release of the sender."""
 
 
+class RoadStatus(Message, frozen=True):
+    """Bridge to observers, every second (wall clock): what keeps the road from driving as planned.
+
+    Missing for 3 s, although the bridge has its token: the bridge hangs. Duplicated: no effect.
+    From an earlier bridge: shows that there are two bridges.
+    """
+
+    bridge: Int64
+    """Incarnation of the bridge [ns]."""
+    clock_s: Real
+    """Wall-clock time of the bridge [s since 1970]."""
+    standing_s: Real = 0.0
+    """Time for which the current tick has waited for agents at the entrance [s, wall clock]."""
+    awaited: tuple[Name, ...] = ()
+    """Vehicles at the entrance whose agents the tick waits for."""
+    unattended: dict[Name, Real] = field(default_factory=dict)
+    """Vehicles on the road without an agent in charge, and for how long [s, wall clock]."""
+    overlaps: Int64 = 0
+    """Number of pairs of bodies that have intersected."""
+    recording: bool = True
+    """Whether the run is still recorded."""
+
+
 class Report(Message, frozen=True):
     """Any role to the recorder: the sender's counters.
 

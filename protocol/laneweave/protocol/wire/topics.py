@@ -119,7 +119,8 @@ class Topic:
 
 CLOCK = Topic(
     "clock", "clock", messages.RoadClock, Party.BRIDGE, Quality.LATEST,
-    readers=(Party.COORDINATOR, Party.OBSERVER),
+    readers=(Party.COORDINATOR, Party.BRIDGE, Party.OBSERVER),
+    remark="the bridge: before it starts, those of another one",
 )  # fmt: skip
 CENSUS = Topic(
     "census", "census", messages.Census, Party.BRIDGE, Quality.LATEST,
@@ -170,6 +171,11 @@ EVENT = Topic(
     readers=(Party.BRIDGE, Party.OBSERVER),
     remark="the bridge's recorder; so far only coordinators send events",
 )  # fmt: skip
+ROAD_STATUS = Topic(
+    "road-status", "road-status", process_messages.RoadStatus, Party.BRIDGE, Quality.LATEST,
+    readers=(Party.BRIDGE, Party.OBSERVER), long=True,
+    remark="the bridge: before it starts, those of another one",
+)  # fmt: skip
 SETTINGS = Topic(
     "settings", "settings/{role}/{name}", process_messages.ProcessSettings, ANY_SENDER,
     Quality.LATEST,
@@ -195,7 +201,9 @@ VEHICLE_ALIVE = Topic(
 )  # fmt: skip
 BRIDGE_ALIVE = Topic(
     "bridge-alive", "alive/bridge/{incarnation}", None, Party.BRIDGE, Quality.ASSURED,
-    readers=(Party.COORDINATOR, Party.VEHICLE, Party.OBSERVER), exchange=Exchange.TOKENS,
+    readers=(Party.COORDINATOR, Party.VEHICLE, Party.BRIDGE, Party.OBSERVER),
+    exchange=Exchange.TOKENS,
+    remark="the bridge: before it starts, those of another one",
 )  # fmt: skip
 # A sender is known by the last part of its keys. The session is a secret between a client and the
 # coordinators: who knows it can send requests in the client's name.

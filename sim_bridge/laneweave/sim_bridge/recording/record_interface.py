@@ -52,6 +52,14 @@ class Record(RoadRecord, Protocol):
     def missed_ticks(self) -> int:
         """Number of answers that were missing at their tick's deadline."""
 
+    @property
+    def overlap_count(self) -> int:
+        """Number of pairs of bodies that have intersected."""
+
+    @property
+    def recording(self) -> bool:
+        """Whether the run is still recorded."""
+
     def on_still_on_road(self, vehicle: RecordedVehicle) -> None:
         """Record a vehicle that is still on the road at the end."""
 

@@ -197,6 +197,16 @@ class RunRecord:
         self.missed_ticks = 0
         """Number of answers that were missing at their tick's deadline."""
 
+    @property
+    def overlap_count(self) -> int:
+        """Number of pairs of bodies that have intersected."""
+        return self._trajectories.overlap_count
+
+    @property
+    def recording(self) -> bool:
+        """Whether the run is still recorded; not after an error of the disk."""
+        return self._disk.works
+
     # --- the road -----------------------------------------------------------------
 
     def event(self, t_s: float, kind: str, /, **data: object) -> None:

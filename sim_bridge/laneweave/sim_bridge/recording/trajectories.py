@@ -145,6 +145,11 @@ class Trajectories:
         self._min_gap_m = min(self._min_gap_m, gaps.gap_m)
         self._min_headway_s = min(self._min_headway_s, gaps.headway_s)
 
+    @property
+    def overlap_count(self) -> int:
+        """Number of pairs of bodies that have intersected."""
+        return len(self._overlaps)
+
     def safety(self) -> Safety:
         """Return the counts and extreme values so far."""
         return Safety(

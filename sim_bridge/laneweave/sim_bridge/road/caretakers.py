@@ -7,7 +7,7 @@ caretaker takes charge and is replaced, and how agents are notified that their v
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Generator, Iterator, Mapping
+from collections.abc import Callable, Collection, Generator, Iterator, Mapping
 from enum import StrEnum
 
 from laneweave.protocol.runtime.node import Effect, Event, Listen, PeerDown, PeerUp, Send, Unlisten
@@ -124,9 +124,9 @@ class Caretakers:
         return vehicle in self._caretakers
 
     @property
-    def caretaker_count(self) -> int:
-        """Number of vehicles with a caretaker in charge."""
-        return len(self._caretakers)
+    def vehicles(self) -> Collection[Name]:
+        """Vehicles with a caretaker in charge."""
+        return self._caretakers.keys()
 
     # --- agents -------------------------------------------------------------------------------
 

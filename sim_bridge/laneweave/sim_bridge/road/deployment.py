@@ -9,6 +9,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 
+from msgspec.structs import replace
+
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.runtime.node import (
     Announce,
@@ -18,6 +20,7 @@ from laneweave.protocol.runtime.node import (
     Listen,
     PeerDown,
     PeerUp,
+    Send,
     Watch,
 )
 from laneweave.protocol.runtime.settings_check import PERIOD_S, Process
@@ -33,9 +36,10 @@ from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.wire.events import SETTINGS_REFUSED
 from laneweave.protocol.wire.identities import Identity
 from laneweave.protocol.wire.messages import Name
-from laneweave.protocol.wire.process_messages import ProcessSettings
+from laneweave.protocol.wire.process_messages import ProcessSettings, RoadStatus
 from laneweave.protocol.wire.topics import (
     PROCESS_ALIVE,
+    ROAD_STATUS,
     ROLES,
     SETTINGS,
     VEHICLE_ALIVE,
@@ -73,6 +77,8 @@ class Deployment:
         """Fleets that have not started an agent in time, until they start another one; None: the
         processes of single vehicles."""
         self._refused: set[Key] = set()
+        self._unattended_since_s: dict[Name, float] = {}
+        """When each vehicle was first published as without an agent."""
         self._publish_s = 0.0 if incarnation > 0 else math.inf
 
     # --- settings -----------------------------------------------------------------------------
@@ -87,13 +93,17 @@ class Deployment:
 
     @property
     def wakeup_s(self) -> float:
-        """When the settings are published next."""
+        """When settings and status are published next."""
         return self._publish_s
 
-    def publish(self, now_s: float) -> Iterator[Effect]:
-        """Publish the settings."""
+    def publish(self, now_s: float, status: RoadStatus) -> Iterator[Effect]:
+        """Publish the settings, and a status with the times without agents."""
         self._publish_s = now_s + PERIOD_S
+        since_s = self._unattended_since_s
+        self._unattended_since_s = {name: since_s.get(name, now_s) for name in status.unattended}
+        lasting = {name: now_s - at_s for name, at_s in self._unattended_since_s.items()}
         yield self._process.settings_effect(self._settings)
+        yield Send(ROAD_STATUS, replace(status, unattended=lasting))
 
     def on_event(self, event: Event, t_s: float, now_s: float) -> None:
         """Handle an event; ignore those that are not about other processes."""

@@ -8,9 +8,12 @@ from attrs import evolve
 from rich.console import Console
 
 from laneweave.launch.cli.status_command import show
+from laneweave.launch.observe.findings import Finding
 from laneweave.launch.observe.road_view import Coordinator, RoadView
 from laneweave.launch.observe.status import Plans, Road, Status, status_of
 from laneweave.protocol.wire.messages import Name
+
+FINDINGS = [Finding("no-bridge", "bridge", "no bridge found", 1.0, "start the bridge")]
 
 
 def shown(status: Status) -> dict[str, str]:
@@ -22,10 +25,11 @@ def shown(status: Status) -> dict[str, str]:
 
 
 def test_a_network_without_a_road() -> None:
-    found = status_of(RoadView(), 0.0, 2.0, 0.7, "tcp/127.0.0.1:7447", "test")
+    found = status_of(RoadView(), FINDINGS, 0.0, 2.0, 0.7, "tcp/127.0.0.1:7447", "test")
     rows = shown(found)
     assert rows == {
         "health": "not healthy",
+        "bridge": "no bridge found",
         "realm": "test",
         "endpoint": "tcp/127.0.0.1:7447",
         "listened": "2.0 s",
@@ -36,7 +40,7 @@ def test_a_network_without_a_road() -> None:
 
 
 def test_a_deployment() -> None:
-    empty = status_of(RoadView(), 0.0, 2.0, 0.7, "tcp/127.0.0.1:7447", "test")
+    empty = status_of(RoadView(), FINDINGS, 0.0, 2.0, 0.7, "tcp/127.0.0.1:7447", "test")
     first = Coordinator(Name("c1"), 1, True, 1, 3, 0.06, True)
     lost = Coordinator(Name("c2"), 1, False, None, None, None, True)
     road = Road(28.1, 2.0, 4.0, False, 25, 24, 4, 20)

@@ -1,0 +1,410 @@
+"""Findings: what is wrong with a deployment, where, since when, and what to do about it.
+
+`RULES` is the only table of problems: `laneweave status`, `/healthz`, the live page, metrics and
+health checks of containers use it. A rule looks at what an observer has received and at what should
+be there (`observed`), and names the processes that it concerns. A condition becomes a finding once
+it has lasted for the rule's `lasts_s`.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
+from typing import Final
+
+from attrs import define, field, frozen
+
+from laneweave.launch.observe.observed import AGENT, BRIDGE, COORDINATOR, FLEET, Expected, Observed
+from laneweave.launch.observe.process_view import label_of
+from laneweave.launch.observe.road_view import RoadView, claims_of
+from laneweave.protocol.scenario.common_settings import (
+    AGENT_GROUPS,
+    GROUPS,
+    CommonSettings,
+    different_groups,
+)
+from laneweave.protocol.wire.codec import VERSION
+from laneweave.protocol.wire.messages import ClosedFormation
+from laneweave.protocol.wire.topics import Party
+
+ROUTER = str(Party.ROUTER)
+SILENT_S = 3.0
+"""Time without a message after which a bridge with a token is silent."""
+STANDING_S = 2.0
+"""Time for which the road may wait for agents."""
+UNATTENDED_S = 2.0
+"""Time for which a vehicle may be without an agent."""
+UNPLANNED_S = 20.0
+"""Road time for which a closed formation may be without a plan."""
+CLOCK_OFF_S = 12 * 3600.0
+"""Difference of clocks above which processes begin to refuse each other's messages (a day)."""
+MAX_NAMED = 3
+"""Maximum number of vehicles that a text names."""
+
+
+@frozen
+class Finding:
+    """A problem of a deployment."""
+
+    rule: str
+    """Name of the rule."""
+    process: str
+    """Role and name of the process that it concerns, such as `coordinator c1`."""
+    what: str
+    for_s: float
+    """For how long it has been observed [s]."""
+    advice: str
+
+    def __str__(self) -> str:
+        """Return one line: what is wrong, and what to do."""
+        return f"{self.what}: {self.advice}"
+
+
+Found = Iterator[tuple[str, str]]
+"""Process and what is wrong with it."""
+
+
+@frozen
+class Rule:
+    """A kind of problem."""
+
+    name: str
+    find: Callable[[Observed], Found]
+    advice: str
+    lasts_s: float = 0.0
+    """Time for which the condition must be observed."""
+    until_end: bool = True
+    """Whether it applies only until the road has ended."""
+    of_process: bool = True
+    """Whether the health check of the process alone applies it: another process may help."""
+
+
+def _link_lost(observed: Observed) -> Found:
+    if not observed.view.linked:
+        yield ROUTER, "the connection to the router was lost"
+
+
+def _no_bridge(observed: Observed) -> Found:
+    view = observed.view
+    if view.bridge_tokens or (not observed.expected.bridge and view.clock is None):
+        return
+    if view.clock is None:
+        yield BRIDGE, "no bridge found"
+    else:
+        yield (
+            BRIDGE,
+            f"the bridge disappeared at {view.clock.t_s:.1f} s, before the end of its road",
+        )
+
+
+def _bridge_silent(observed: Observed) -> Found:
+    for bridge in observed.view.bridge_tokens & {observed.view.bridge, *_only(observed)}:
+        silent_s = observed.unheard_s(bridge)
+        never = bridge not in observed.view.processes.bridges_heard_s
+        if silent_s >= (1.5 if never else SILENT_S):
+            yield BRIDGE, f"nothing heard from the bridge for {silent_s:.1f} s"
+
+
+def _only(observed: Observed) -> Iterable[int]:
+    """Return the newest bridge with a token if no bridge has been heard."""
+    tokens = observed.view.bridge_tokens
+    return [max(tokens)] if tokens and observed.view.bridge < 0 else []
+
+
+def _several_bridges(observed: Observed) -> Found:
+    heard = [
+        bridge
+        for bridge in sorted(observed.view.bridge_tokens)
+        if observed.unheard_s(bridge) < SILENT_S
+        and bridge in observed.view.processes.bridges_heard_s
+    ]
+    if len(heard) > 1:
+        yield BRIDGE, f"{len(heard)} bridges are in this realm, and agents follow the newest one"
+
+
+def _road_stands(observed: Observed) -> Found:
+    status, clock = observed.status, observed.view.clock
+    if status is None or clock is None or status.standing_s < STANDING_S:
+        return
+    by_process: dict[str, list[str]] = {}
+    for vehicle in status.awaited:
+        by_process.setdefault(_starter(observed, vehicle), []).append(vehicle)
+    for process, vehicles in by_process.items():
+        lasting = f"the road has stood at {clock.t_s:.1f} s for {status.standing_s:.0f} s"
+        yield process, f"{lasting}, waiting for {_named(vehicles)}"
+
+
+def _no_leader(observed: Observed) -> Found:
+    candidates = observed.candidates
+    if claims_of(candidates):
+        return
+    count = len(candidates)
+    found = "one coordinator" if count == 1 else f"{count or 'no'} coordinators"
+    yield COORDINATOR, f"there is no leader: {found} found"
+
+
+def _several_leaders(observed: Observed) -> Found:
+    claims = claims_of(observed.candidates)
+    if len({one.coordinator for one in claims}) > 1:
+        names = " and ".join(sorted(one.coordinator for one in claims))
+        for one in claims[1:]:
+            yield label_of(COORDINATOR, one.coordinator), f"{names} all lead"
+
+
+def _same_name(observed: Observed) -> Found:
+    # The token of a killed process may persist, so only processes with heartbeats count.
+    active = Counter(
+        one.coordinator for one in observed.candidates if one.is_active(observed.election_s)
+    )
+    for name, processes in active.items():
+        if processes > 1:
+            what = f"{processes} coordinators have the name {name}, which must be unique"
+            yield label_of(COORDINATOR, name), what
+
+
+def _coordinator_missing(observed: Observed) -> Found:
+    there = {one.coordinator for one in observed.candidates}
+    for name in observed.expected.coordinators:
+        if name not in there:
+            yield label_of(COORDINATOR, name), f"no coordinator {name} found"
+
+
+def _coordinator_silent(observed: Observed) -> Found:
+    active = {one.coordinator for one in observed.candidates if one.is_active(observed.election_s)}
+    for one in observed.candidates:
+        if one.coordinator not in active:
+            yield (
+                label_of(COORDINATOR, one.coordinator),
+                f"no heartbeat of coordinator {one.coordinator} for {observed.election_s:g} s",
+            )
+
+
+def _nothing_planned(observed: Observed) -> Found:
+    """Find a leader that plans no formation although some have been closed for long.
+
+    A single formation without a plan may have been closed too late to sort; those behind it have
+    plans then.
+    """
+    view = observed.view
+    claims = claims_of(observed.candidates)
+    if view.census is None or not claims:
+        return
+    states = view.states.values()
+    accepted = {state.block for state in states if state.accepted}
+    unattended = {state.block for state in states if not state.attended}
+    known = {state.block for state in states} - unattended
+    waiting: list[ClosedFormation] = []
+    for one in sorted(view.census.formations, key=lambda one: one.closed_s):
+        blocks = one.blocks
+        if accepted.intersection(blocks):
+            waiting = []
+        elif view.t_s - one.closed_s >= UNPLANNED_S and unattended.isdisjoint(blocks):
+            waiting += [one] if known.intersection(blocks) else []
+    if waiting:
+        longest_s = view.t_s - waiting[0].closed_s
+        have = "formation has" if len(waiting) == 1 else f"{len(waiting)} formations have"
+        what = f"the newest closed {have} no plan, for up to {longest_s:.0f} s"
+        yield label_of(COORDINATOR, claims[0].coordinator), what
+
+
+def _fleet_missing(observed: Observed) -> Found:
+    present = set(observed.shards_present().values())
+    for name, shard in observed.fleets.items():
+        # Fleets of the release before have no token of their own.
+        attended = any(shard.contains(vehicle) for vehicle in observed.view.agent_tokens)
+        if shard not in present and not attended:
+            yield (
+                label_of(FLEET, name),
+                f"no process found for the vehicles of shard {shard.index}/{shard.count}",
+            )
+
+
+def _agent_missing(observed: Observed) -> Found:
+    for vehicle in observed.expected.vehicles:
+        if vehicle not in observed.view.agent_tokens:
+            yield label_of(AGENT, vehicle), f"no agent of {vehicle} found"
+
+
+def _unattended(observed: Observed) -> Found:
+    by_process: dict[str, dict[str, float]] = {}
+    for vehicle, for_s in observed.unattended().items():
+        if for_s >= UNATTENDED_S:
+            by_process.setdefault(_starter(observed, vehicle), {})[vehicle] = for_s
+    for process, vehicles in by_process.items():
+        count = len(vehicles)
+        have = "vehicle has" if count == 1 else "vehicles have"
+        longest = max(vehicles, key=lambda one: vehicles[one])
+        yield (
+            process,
+            f"{count} {have} no agent, such as {longest} for {vehicles[longest]:.0f} s",
+        )
+
+
+def _starter(observed: Observed, vehicle: str) -> str:
+    """Return the process that starts the agent of a vehicle, as far as known."""
+    for name, shard in observed.fleets.items():
+        if shard.contains(vehicle):
+            return label_of(FLEET, name)
+    return label_of(AGENT, vehicle) if vehicle in observed.expected.vehicles else "agents"
+
+
+def _other_settings(observed: Observed) -> Found:
+    processes = observed.view.processes
+    newest = observed.view.bridge
+    bridge = next((one for one in processes.tokens if one.incarnation == newest), None)
+    if bridge is None:
+        return
+    values = processes.settings.get((bridge.role, bridge.name, bridge.incarnation))
+    for one in sorted(processes.tokens, key=lambda one: one.label):
+        if one.role == BRIDGE:
+            continue
+        used = tuple(GROUPS) if one.role == COORDINATOR else AGENT_GROUPS
+        groups = [name for name in different_groups(one.digests, bridge.digests) if name in used]
+        if not groups:
+            continue
+        own = processes.settings.get((one.role, one.name, one.incarnation))
+        what = f"settings of {', '.join(groups)} differ from those of the bridge"
+        if own is not None and values is not None:
+            found = CommonSettings(own.values).differences(values.values, used)
+            what = "; ".join(str(each) for each in found[:MAX_NAMED]) or what
+        yield one.label, f"{one.label} does not act on the road: {what}"
+
+
+def _clock_off(observed: Observed) -> Found:
+    status = observed.status
+    if status is not None and abs(status.clock_s - observed.wall_s) > CLOCK_OFF_S:
+        yield BRIDGE, f"the clock of the bridge is {_off(status.clock_s - observed.wall_s)}"
+    for one in sorted(observed.view.processes.tokens, key=lambda one: one.label):
+        # Its start time: a process may have run for long, but not have started in the future.
+        ahead_s = one.incarnation / 1e9 - observed.wall_s
+        if one.role != BRIDGE and ahead_s > CLOCK_OFF_S:
+            yield one.label, f"the clock of {one.label} is {_off(ahead_s)}"
+
+
+def _off(ahead_s: float) -> str:
+    relation = "ahead of" if ahead_s > 0 else "behind"
+    return f"{abs(ahead_s) / 3600:.0f} h {relation} that of this host"
+
+
+def _overlap(observed: Observed) -> Found:
+    status = observed.status
+    if status is not None and status.overlaps:
+        pairs = "pair" if status.overlaps == 1 else "pairs"
+        yield BRIDGE, f"bodies have overlapped: {status.overlaps} {pairs}"
+
+
+def _not_recorded(observed: Observed) -> Found:
+    status = observed.status
+    if status is not None and not status.recording:
+        yield BRIDGE, "the run is no longer recorded"
+
+
+def _other_version(observed: Observed) -> Found:
+    for sender, version in observed.view.processes.other_versions.items():
+        yield sender, f"messages of {sender} have version {version!r:.40}, not {VERSION}"
+
+
+def _named(vehicles: list[str]) -> str:
+    shown, more = ", ".join(vehicles[:MAX_NAMED]), len(vehicles) - MAX_NAMED
+    agents = "the agent of" if len(vehicles) == 1 else "the agents of"
+    return f"{agents} {shown}" + (f" and {more} more" if more > 0 else "")
+
+
+RULES: Final = (
+    Rule("link-lost", _link_lost, "restart the router, or repair the network", until_end=False),
+    Rule(
+        "overlap",
+        _overlap,
+        "stop the road, and keep its folder for an examination",
+        until_end=False,
+        of_process=False,
+    ),
+    Rule(
+        "other-version",
+        _other_version,
+        "run the same release everywhere",
+        until_end=False,
+    ),
+    Rule("no-bridge", _no_bridge, "start the bridge", lasts_s=1.0),
+    Rule("several-bridges", _several_bridges, "stop all but one", lasts_s=1.0, of_process=False),
+    Rule("bridge-silent", _bridge_silent, "resume or restart it"),
+    Rule("clock-off", _clock_off, "set the clock, and restart the process"),
+    Rule(
+        "other-settings",
+        _other_settings,
+        "give both processes the same file, and restart one",
+        lasts_s=0.5,
+    ),
+    Rule("same-name", _same_name, "stop one of them", lasts_s=0.5),
+    Rule("no-leader", _no_leader, "start a coordinator", lasts_s=1.0, until_end=False),
+    Rule(
+        "several-leaders",
+        _several_leaders,
+        "compare the clocks of their hosts, and restart one",
+        lasts_s=3.0,
+    ),
+    Rule("coordinator-missing", _coordinator_missing, "start it", lasts_s=1.0),
+    Rule("coordinator-silent", _coordinator_silent, "resume or restart it", lasts_s=1.0),
+    Rule("fleet-missing", _fleet_missing, "start it", lasts_s=1.0),
+    Rule("agent-missing", _agent_missing, "start it", lasts_s=0.5),
+    Rule("road-stands", _road_stands, "start or restart the process of the agents"),
+    Rule("unattended", _unattended, "start or restart the process of the agents"),
+    Rule("nothing-planned", _nothing_planned, "read its log, or restart it", lasts_s=0.5),
+    Rule(
+        "not-recorded",
+        _not_recorded,
+        "free space, and start a new run",
+        until_end=False,
+        of_process=False,
+    ),
+)
+"""All rules, the most telling ones first: a missing bridge explains what others find."""
+
+
+@define
+class Findings:
+    """The findings of an observer, which looks again and again."""
+
+    expected: Expected
+    began_s: float
+    """When observation began, on the clock of the observer."""
+    election_s: float
+    """Time without a heartbeat after which a coordinator no longer leads."""
+    process: str | None = None
+    """Role and name of the only process of interest; None: all."""
+    _since_s: dict[tuple[str, str], float] = field(factory=dict)
+    """Since when each condition has been observed without a break, by rule and process."""
+    _first_s: float | None = None
+    """Time of the first look."""
+
+    def look(
+        self, view: RoadView, now_s: float, wall_s: float, *, last: bool = False
+    ) -> list[Finding]:
+        """Look at what was received until now, and return the findings, the gravest first.
+
+        Args:
+            view: what was received.
+            now_s: current time on the clock of the observer.
+            wall_s: wall-clock time [s since 1970].
+            last: whether this is the last look: what was so at each look counts, even if that was
+                shorter than the rule asks for.
+        """
+        observed = Observed(view, self.expected, self.began_s, now_s, wall_s, self.election_s)
+        self._first_s = now_s if self._first_s is None else self._first_s
+        findings, since_s = [], dict[tuple[str, str], float]()
+        for rule in RULES:
+            if (rule.until_end and observed.ended) or not self._concerns(rule):
+                continue
+            for process, what in rule.find(observed):
+                if self.process not in (None, process) and process != ROUTER:
+                    continue
+                key = rule.name, process
+                at_s = since_s[key] = self._since_s.get(key, now_s)
+                always = last and at_s <= self._first_s
+                if always or now_s >= at_s + rule.lasts_s:
+                    findings.append(Finding(rule.name, process, what, now_s - at_s, rule.advice))
+        self._since_s = since_s
+        return findings
+
+    def _concerns(self, rule: Rule) -> bool:
+        return self.process is None or rule.of_process
