@@ -171,13 +171,9 @@ workers = 1
         return took_s
 
     def workers(self, name: str) -> list[int]:
-        """Return the ids of a coordinator's workers."""
+        """Return the ids of a coordinator's workers, the forks of its fork server."""
         children = psutil.Process(self.coordinators[name].pid).children()
-        return [
-            child.pid
-            for child in children
-            if all("resource_tracker" not in w for w in child.cmdline())
-        ]
+        return [worker.pid for server in children for worker in server.children()]
 
     def rss_mb(self, name: str) -> float:
         """Return the memory of a coordinator's own process."""
