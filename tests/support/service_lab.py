@@ -66,6 +66,8 @@ class ServiceLab:
     names: tuple[str, ...]
     limits: str = ""
     endpoint: str = field(factory=free_tcp)
+    options: tuple[str, ...] = ()
+    """Options of the coordinators."""
     coordinators: dict[str, subprocess.Popen[str]] = field(factory=dict)
     ended: list[Ended] = field(factory=list)
     """What became of coordinators that were killed."""
@@ -131,7 +133,7 @@ workers = 1
             missing = []
         for name in missing:
             self.coordinators[name] = self.lab.start(
-                "coordinator", "--config", "deployment.toml", "--name", name
+                "coordinator", "--config", "deployment.toml", "--name", name, *self.options
             )
         self.lab.wait_until(lambda: self.alive == set(self.coordinators), END_S)
         with PlanClient(self.access) as client:
