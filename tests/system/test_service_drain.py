@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import time
 from collections.abc import Callable, Iterator
@@ -62,7 +63,7 @@ def test_pending_requests_are_answered_while_others_take_new_ones(
     (idle,) = service.workers("c2")
     with busy(service, 6.0) as (answer, process):
         stopping = service.coordinators.pop("c1")
-        stopping.terminate()
+        os.killpg(stopping.pid, signal.SIGTERM)  # also the workers get it, as from `timeout`
         # It is no candidate any more, and new requests go to the other one.
         service.lab.wait_until(lambda: service.alive == {"c2"}, END_S)
         with PlanClient(service.access) as other:
