@@ -58,6 +58,12 @@ def slow_request(name: str, deadline_s: float) -> dict[str, Any]:
     )
 
 
+def cpu_s(process: int) -> float:
+    """Return the CPU time that a process has used."""
+    times = psutil.Process(process).cpu_times()
+    return float(times.user + times.system)
+
+
 @define
 class ServiceLab:
     """Coordinators with one worker each; those that a test kills are started again."""

@@ -15,7 +15,7 @@ import pytest
 from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.coordinator.service.client import PlanClient
 from support.harness import END_S, Lab
-from support.service_lab import ServiceLab, request, slow_request
+from support.service_lab import ServiceLab, cpu_s, request, slow_request
 
 NAMES = ("c1", "c2")
 STATUSES = ("feasible", "optimal", "timeout")
@@ -49,11 +49,6 @@ def busy(service: ServiceLab, deadline_s: float) -> Iterator[tuple[Future[str], 
         service.lab.wait_until(lambda: cpu_s(worker) > spent_s + 0.2, END_S)
         yield answer, process
         client.cancel(asked.id)
-
-
-def cpu_s(process: int) -> float:
-    """Return the CPU time that a process has used."""
-    return float(psutil.Process(process).cpu_times().user)
 
 
 def test_pending_requests_are_answered_while_others_take_new_ones(

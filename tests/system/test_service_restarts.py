@@ -7,6 +7,7 @@ import json
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any
 
 import pytest
 
@@ -17,7 +18,7 @@ from laneweave.coordinator.service.client import (
     ServiceUnavailableError,
 )
 from support.harness import END_S, Lab
-from support.service_lab import ServiceLab, request, slow_request
+from support.service_lab import ServiceLab, cpu_s, request, slow_request
 
 TIMEOUT_S = 20.0
 AWAY_S = 5.0
@@ -53,13 +54,17 @@ def test_waiting_clients_get_their_answers_from_a_coordinator_that_restarts(
     service: ServiceLab,
 ) -> None:
     path = service.lab.path("request.json", json.dumps(request()))
-    # All of these wait behind the first one when the coordinator is killed.
-    made = [slow_request("first", 2.0), *(request(f"r{n}") for n in range(2 * CLIENTS))]
-    with ThreadPoolExecutor(len(made)) as pool:
-        answers: list[Future[str]] = [
-            pool.submit(KINDS[n % 2], service, PlanRequest.from_dict(data), TIMEOUT_S)
-            for n, data in enumerate(made)
-        ]
+    (worker,) = service.workers("c1")
+    spent_s = cpu_s(worker)
+    with ThreadPoolExecutor(1 + 2 * CLIENTS) as pool:
+
+        def submit(kind: Ask, data: dict[str, Any]) -> Future[str]:
+            return pool.submit(kind, service, PlanRequest.from_dict(data), TIMEOUT_S)
+
+        answers = [submit(ask, slow_request("first", 5.0))]
+        service.lab.wait_until(lambda: cpu_s(worker) > spent_s + 0.2, END_S)
+        # These wait behind the first one when the coordinator is killed.
+        answers += [submit(KINDS[n % 2], request(f"r{n}")) for n in range(2 * CLIENTS)]
         time.sleep(1.0)
         service.kill("c1")
         command = service.lab.start("plan", path, "--connect", service.endpoint)
