@@ -18,8 +18,9 @@ separate process. Requests are formations of 6 to 18 vehicles. The measurements:
 - *loss*: three coordinators with one worker each, of which one after another is killed. The figures
   count the requests that were in flight when one was killed, or were sent within the next second.
 - *cancel*: a client asks for a plan that takes 5 s, and cancels its task, exceeds its timeout, or
-  is killed. The figures are the latencies of a small request that another client sends at that
-  moment to the same single worker.
+  is killed; or its request is so large that the planner does not read the clock for seconds. The
+  figures are the latencies of a small request that another client sends at that moment to the same
+  single worker.
 - *flood*: the latency of small requests that one client sends one after the other, alone and while
   another client has 1000 requests in flight. The flooding client is a `PlanClient`, which waits
   before it repeats a refused request, or a program that sends another request at once.
@@ -50,13 +51,15 @@ import attrs
 import numpy as np
 from attrs import define, field, frozen
 
+from laneweave.coordinator.planning.grid import Grid
 from laneweave.coordinator.planning.kernels import BRANCHING
-from laneweave.coordinator.planning.request import PlanRequest
+from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
 from laneweave.coordinator.planning.response import PlanResponse
 from laneweave.coordinator.planning.solve import plan
 from laneweave.coordinator.service.client import AsyncPlanClient, PlanClient, PlanError
 from laneweave.coordinator.service.format import JSON
 from laneweave.launch.bench.request_families import formation_request
+from laneweave.protocol.scenario.formation_table import DEFAULT_CONFLICTS
 from laneweave.protocol.security.connection import Access
 from laneweave.protocol.transports.zenoh.transport import ZenohTransport
 from laneweave.protocol.wire.topics import SERVICE, Keys
@@ -327,6 +330,19 @@ def long_request(seed: int) -> PlanRequest:
     return formation_request(seed, vehicles=LONG_VEHICLES, deadline_s=LONG_S)
 
 
+def large_request(seed: int) -> PlanRequest:
+    """Return a request for which the planner hardly reads the clock."""
+    columns, lanes = 1000, 16
+    vehicles = tuple(
+        VehicleRequest(f"v{i}", (i // lanes * 2, i % lanes), lanes - 1 - i % lanes)
+        for i in range(200)
+    )
+    targets = tuple((i // lanes, i % lanes) for i in range(400))
+    grid = Grid(columns, lanes)
+    name = f"large-{seed}"
+    return PlanRequest(grid, 2, DEFAULT_CONFLICTS[2], vehicles, targets, LONG_S, id=name)
+
+
 async def cancel_task(endpoint: str, request: PlanRequest) -> None:
     """Ask, and cancel the task that waits for the answer."""
     async with AsyncPlanClient(endpoint) as client:
@@ -364,13 +380,22 @@ def _ask_forever(endpoint: str, request: PlanRequest, asked: threading.Event) ->
 
 def cancel() -> list[dict[str, Any]]:
     """Measure how soon a worker is free after the client of its request has left."""
-    ways = {"task cancelled": cancel_task, "timeout": exceed_timeout, "client killed": be_killed}
+    ways = {
+        "task cancelled": (cancel_task, long_request),
+        "timeout": (exceed_timeout, long_request),
+        "client killed": (be_killed, long_request),
+        "timeout, 200 vehicles": (exceed_timeout, large_request),
+    }
 
-    async def latencies_ms(endpoint: str, leave: Callable[..., Awaitable[None]]) -> list[float]:
+    async def latencies_ms(
+        endpoint: str,
+        leave: Callable[..., Awaitable[None]],
+        make: Callable[[int], PlanRequest],
+    ) -> list[float]:
         found = []
         async with AsyncPlanClient(endpoint) as client:
             for seed in range(LEAVES):
-                await leave(endpoint, long_request(seed))
+                await leave(endpoint, make(seed))
                 small = formation_request(seed, deadline_s=DEADLINE_S)
                 found.append(1e3 * (await request_plan(client, small)).latency_s)
         return found
@@ -378,8 +403,8 @@ def cancel() -> list[dict[str, Any]]:
     with network(coordinators=1, workers=1) as net:
         return [
             {"client": name, "times": LEAVES, "plan_s": LONG_S}
-            | {"next_ms": quantiles(asyncio.run(latencies_ms(net.endpoint, leave)))}
-            for name, leave in ways.items()
+            | {"next_ms": quantiles(asyncio.run(latencies_ms(net.endpoint, leave, make)))}
+            for name, (leave, make) in ways.items()
         ]
 
 

@@ -26,6 +26,7 @@ from laneweave.protocol.wire.messages import (
     Sense,
     VehicleState,
 )
+from laneweave.protocol.wire.process_messages import Report
 from laneweave.protocol.wire.topics import (
     BRIDGE_ALIVE,
     CENSUS,
@@ -33,6 +34,7 @@ from laneweave.protocol.wire.topics import (
     COMMAND,
     HEARTBEAT,
     PREPARE,
+    REPORT,
     SENSE,
     STATE,
     Keys,
@@ -192,6 +194,11 @@ class Forger:
         forged = Heartbeat(Name("zz"), 1, term, leading=False, plans=0)
         self.publish(HEARTBEAT, forged, coordinator="zz")
 
+    def report(self, role: str, name: str, **counters: Any) -> None:  # noqa: ANN401
+        """Publish a report."""
+        message = Report(Name(role), Name(name), Name("forger"), **counters)
+        self.publish(REPORT, message, role=role, name=name)
+
     def flip_token(self, incarnation: int) -> None:
         """Show the token of a bridge, or withdraw it."""
         key = self._keys.key(BRIDGE_ALIVE, incarnation=incarnation)
@@ -249,6 +256,9 @@ ROWS: Mapping[str, Callable[[Forger], None]] = {
     ),
     "sense-bridge": lambda forger: forger.change_victims(SENSE, bridge=HUGE),
     "sense-bridge-possible": lambda forger: forger.change_victims(SENSE, bridge=NOW_NS() + HOUR_NS),
+    "report": lambda forger: forger.report("coordinator", "zz", published=HUGE, rejected=HUGE),
+    "report-negative": lambda forger: forger.report("coordinator", "zz", rejected=-(2**62)),
+    "report-solves": lambda forger: forger.report("coordinator", "zz", solves=HUGE),
     "sense-tick": lambda forger: forger.change_victims(SENSE, tick=HUGE),
     "sense-tick-possible": lambda forger: forger.change_victims(SENSE, tick=900_000, t_s=9e4),
 }

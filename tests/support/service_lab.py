@@ -58,6 +58,12 @@ def slow_request(name: str, deadline_s: float) -> dict[str, Any]:
     )
 
 
+def cpu_s(process: int) -> float:
+    """Return the CPU time that a process has used."""
+    times = psutil.Process(process).cpu_times()
+    return float(times.user + times.system)
+
+
 @define
 class ServiceLab:
     """Coordinators with one worker each; those that a test kills are started again."""
@@ -66,6 +72,8 @@ class ServiceLab:
     names: tuple[str, ...]
     limits: str = ""
     endpoint: str = field(factory=free_tcp)
+    options: tuple[str, ...] = ()
+    """Options of the coordinators."""
     coordinators: dict[str, subprocess.Popen[str]] = field(factory=dict)
     ended: list[Ended] = field(factory=list)
     """What became of coordinators that were killed."""
@@ -131,7 +139,7 @@ workers = 1
             missing = []
         for name in missing:
             self.coordinators[name] = self.lab.start(
-                "coordinator", "--config", "deployment.toml", "--name", name
+                "coordinator", "--config", "deployment.toml", "--name", name, *self.options
             )
         self.lab.wait_until(lambda: self.alive == set(self.coordinators), END_S)
         with PlanClient(self.access) as client:
@@ -171,13 +179,9 @@ workers = 1
         return took_s
 
     def workers(self, name: str) -> list[int]:
-        """Return the ids of a coordinator's workers."""
+        """Return the ids of a coordinator's workers, the forks of its fork server."""
         children = psutil.Process(self.coordinators[name].pid).children()
-        return [
-            child.pid
-            for child in children
-            if all("resource_tracker" not in w for w in child.cmdline())
-        ]
+        return [worker.pid for server in children for worker in server.children()]
 
     def rss_mb(self, name: str) -> float:
         """Return the memory of a coordinator's own process."""

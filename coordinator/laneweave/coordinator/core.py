@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import random
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import structlog
 from attrs import frozen
@@ -27,6 +27,7 @@ from laneweave.protocol.runtime.node import (
     Arrived,
     Computed,
     Effect,
+    End,
     Event,
     Listen,
     MessagesDropped,
@@ -40,6 +41,7 @@ from laneweave.protocol.runtime.node import (
     Stopping,
     Unlisten,
     Watch,
+    Withdraw,
 )
 from laneweave.protocol.runtime.transport import LinkDown, LinkUp
 from laneweave.protocol.scenario.fields import Scenario
@@ -142,6 +144,8 @@ class CoordinatorCore:
         self._next_heartbeat_s = 0.0
         self._next_report_s = 0.0
         self._wakeup_s: float | None = None
+        self._ends_s: float | None = None
+        """End of the grace after a stop signal; None: there was none."""
         self.operation = self._make_operation(rules, transfer_rules, make_planner, plan)
 
     def _make_operation(
@@ -203,11 +207,12 @@ class CoordinatorCore:
             effects = list(self._effects(outcomes or ()))
         else:
             effects = list(self._on_event(event, now_s))
-        if not isinstance(event, Stopping):
+        if not isinstance(event, Stopping) or event.grace_s:
             effects += self._on_election(now_s)
             effects += self._lead(now_s)
             effects += self._periodic_messages(now_s)
             effects += self.service.wake(now_s)
+            effects += self._end(now_s)
             self._set_wakeup(now_s)
         return effects
 
@@ -268,8 +273,8 @@ class CoordinatorCore:
                 yield from self._on_query(event, now_s)
             case Computed():
                 yield from self._on_computed(event, now_s)
-            case Stopping():
-                yield self._report()
+            case Stopping(grace_s):
+                yield from self._retire(now_s + grace_s) if grace_s else (self._report(),)
             case _:
                 pass
 
@@ -291,11 +296,14 @@ class CoordinatorCore:
         yield Watch(COORDINATOR_ALIVE)
         yield Watch(BRIDGE_ALIVE)
         yield Watch(CLIENT_ALIVE)
-        yield Announce(
-            COORDINATOR_ALIVE, {"coordinator": self.name, "incarnation": self._incarnation}
-        )
+        yield Announce(COORDINATOR_ALIVE, self._own)
         yield Serve(SERVICE)
         yield Serve(SERVICE_CANCEL)
+
+    @property
+    def _own(self) -> Mapping[str, Any]:
+        """Parameters of this candidate's token."""
+        return {"coordinator": self.name, "incarnation": self._incarnation}
 
     def _on_candidate(self, name: str, incarnation: int, now_s: float) -> None:
         if name == self.name and incarnation != self._incarnation:
@@ -359,15 +367,35 @@ class CoordinatorCore:
     def _periodic_messages(self, now_s: float) -> Iterator[Effect]:
         if now_s >= self._next_heartbeat_s:
             self._next_heartbeat_s = now_s + self.scenario.network.heartbeat_s
-            term, leading = self.election.term, self.election.leading
-            yield Send(
-                HEARTBEAT,
-                Heartbeat(self.name, self._incarnation, term, leading, self.operation.in_force),
-                {"coordinator": self.name},
-            )
+            if not self.election.retired:
+                yield self._heartbeat()
         if now_s >= self._next_report_s:
             self._next_report_s = now_s + REPORT_S
             yield self._report()
+
+    def _heartbeat(self) -> Effect:
+        term, leading = self.election.term, self.election.leading
+        message = Heartbeat(self.name, self._incarnation, term, leading, self.operation.in_force)
+        return Send(HEARTBEAT, message, {"coordinator": self.name})
+
+    # --- the end ------------------------------------------------------------------------------
+
+    def _retire(self, ends_s: float) -> Iterator[Effect]:
+        """Leave leadership and new requests to others; finish the pending requests.
+
+        Without heartbeats and token, the other candidates do not count this one any more.
+        """
+        self._ends_s = ends_s
+        self.election.retired = True
+        yield Withdraw(COORDINATOR_ALIVE, self._own)
+        yield from self.service.retire()
+
+    def _end(self, now_s: float) -> Iterator[Effect]:
+        """End if there is nothing left to finish, or no time for it."""
+        if self._ends_s is not None and (self.service.idle or now_s >= self._ends_s):
+            yield from self.service.give_up()
+            yield self._report()
+            yield End()
 
     # --- leading ------------------------------------------------------------------------------
 
@@ -414,8 +442,7 @@ class CoordinatorCore:
     def _set_wakeup(self, now_s: float) -> None:
         election = self.election
         times = [self._next_heartbeat_s, self._next_report_s, election.next_change_s(now_s)]
-        if (service_s := self.service.wakeup_s) is not None:
-            times.append(service_s)
+        times += [time_s for time_s in (self.service.wakeup_s, self._ends_s) if time_s is not None]
         if election.leading:
             times += self.operation.wakeups
         else:

@@ -56,6 +56,8 @@ class Election:
     """Higher terms are not adopted; grows with road time."""
     leading: bool = False
     link_up: bool = True
+    retired: bool = False
+    """Whether this candidate is about to exit, so that it leads no more."""
     won: int = 0
     """Number of times that this candidate has become leader."""
     _peers: dict[str, _Peer] = field(factory=dict)
@@ -152,7 +154,8 @@ class Election:
             and (not self.leading or peer.leading or now_s >= self._patience_s(peer))
             for name, peer in self._peers.items()
         )
-        lead = self.link_up and not rival and now_s >= self.started_s + self.election_s
+        eligible = self.link_up and not self.retired
+        lead = eligible and not rival and now_s >= self.started_s + self.election_s
         if lead == self.leading:
             return False
         self.leading = lead

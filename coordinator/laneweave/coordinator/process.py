@@ -53,6 +53,7 @@ def run_coordinator(
     observe: Observe = unobserved,
     *,
     fork_workers: bool = False,
+    grace_s: float = 0.0,
 ) -> None:
     """Run a coordinator candidate until SIGINT or SIGTERM.
 
@@ -66,6 +67,7 @@ def run_coordinator(
         observe: registers the metrics source.
         fork_workers: whether the planning service forks its worker processes now, with the planner
             loaded, instead of starting new ones at its first request.
+        grace_s: time to answer pending requests after the first signal [s].
 
     Raises:
         BadInputError: no router answers at the scenario's endpoint, or there is no such solver.
@@ -92,7 +94,8 @@ def run_coordinator(
             pool.fork()  # before the compilation starts a thread
         with contextlib.closing(BackgroundCompilation(BRANCHING)):
             access = access_of(scenario, f"coordinator.{name}")
-            run_core(wrap(checked), access, pool, partial(_observe_solvers, observe))
+            observe = partial(_observe_solvers, observe)
+            run_core(wrap(checked), access, pool, observe, grace_s=grace_s)
 
 
 def _load_branching() -> None:

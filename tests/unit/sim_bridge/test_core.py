@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 from msgspec.structs import replace
@@ -13,6 +14,7 @@ from laneweave.protocol.runtime.node import (
     Event,
     Listen,
     PeerDown,
+    Refuse,
     Send,
     Stopping,
     Wakeup,
@@ -411,6 +413,45 @@ def test_reports_about_vehicles_of_an_earlier_run_do_not_count(tmp_path: Path) -
     assert desk.core.phase is TickPhase.SHUTTING_DOWN
     assert ended(desk.report("agent", B, solves=2))
     assert read_summary(tmp_path)["tracking"]["solves"] == 3
+
+
+@pytest.mark.parametrize(
+    "forged",
+    [
+        {"rejected": 2**63 - 1},
+        {"published": 2**63 - 1},
+        {"published": -1},
+        {"solves": 2**63 - 1},
+        {"unusable": -5},
+        {"solves": 1, "osqp_solves": 2},
+        {"solves": 1, "solve_ms": b"\x00\x00\xc0\x7f"},  # NaN
+    ],
+    ids=str,
+)
+def test_reports_with_impossible_numbers_are_refused_and_add_nothing(
+    tmp_path: Path, forged: dict[str, Any]
+) -> None:
+    desk = wound_up(tmp_path)
+    desk.report("coordinator", "c1", process=Name("c"), published=70, rejected=7)
+    for role, name in (("coordinator", "c1"), ("coordinator", "c2"), ("agent", A)):
+        effects = desk.report(role, name, **forged)
+        assert [type(effect) for effect in effects] == [Refuse]
+    desk.report_own()
+    desk.report("agent", B, solves=2)
+    # The vehicle's own report is still awaited.
+    assert ended(desk.report("agent", A, solves=1))
+    found = read_summary(tmp_path)
+    assert found["messages"]["published"] == 70
+    assert found["messages"]["rejected"] == 7
+    assert found["tracking"]["solves"] == 3
+
+
+def test_a_report_in_the_name_of_another_is_refused(tmp_path: Path) -> None:
+    # A certificate of a vehicle permits the key of its own report only.
+    desk = wound_up(tmp_path)
+    forged = Report(Name("coordinator"), Name("c1"), rejected=5)
+    (effect,) = desk.give(Arrived(topics.REPORT, {"role": "agent", "name": A}, forged))
+    assert isinstance(effect, Refuse)
 
 
 @pytest.mark.parametrize("stopped", [False, True])

@@ -10,9 +10,10 @@ A client of a deployment, secured or not, reads the deployment's configuration a
 
     PlanClient(client_access(Path("deployment.toml"), "dispatch"))
 
-Several threads, or tasks, may share a client. If a coordinator exits before it has answered,
-the client sends the request again under the same id. A request whose call ends without an answer
-(timeout, Ctrl-C, cancelled task) is cancelled, as are all requests of a client that disconnects.
+Several threads, or tasks, may share a client. If a coordinator exits before it has answered, or
+none is running, the client sends the request again under the same id until its timeout. A request
+whose call ends without an answer (timeout, Ctrl-C, cancelled task) is cancelled, as are all
+requests of a client that disconnects.
 
 Coordinators serve clients in turn. A client is a certificate's name; on a network that is not
 secured, each connection is a client of its own.
@@ -31,7 +32,7 @@ from types import TracebackType
 from typing import Self
 
 import attrs
-from attrs import define, field
+from attrs import define
 
 from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.coordinator.planning.response import PlanResponse
@@ -63,10 +64,6 @@ LONGEST_PAUSE_S = 0.5
 """Longest pause, unless a coordinator asks for a longer one."""
 CANCEL_S = 1.0
 """Timeout of a cancellation."""
-ABSENT_S = 3.0
-"""Time without any answer after which the service counts as absent. A killed coordinator is
-detected at once, a hanging one after `network.lease_s`; a restarted router is found within a
-second."""
 
 
 class PlanError(Exception):
@@ -83,7 +80,7 @@ class RequestRefusedError(PlanError):
 
 
 class ServiceUnavailableError(PlanError):
-    """No coordinator on this network can be reached."""
+    """No coordinator on this network has answered."""
 
 
 class ServiceOverloadedError(PlanError):
@@ -114,10 +111,9 @@ class PendingRequest:
     request: PlanRequest
     timeout_s: float
     begun_s: float
-    patience_s: float = ABSENT_S
-    """Time without any answer after which the service counts as absent [s]."""
+    network: str
+    """Endpoint and realm, for errors."""
     _pause_s: float = FIRST_PAUSE_S
-    _absent_since_s: float | None = field(default=None)
 
     @property
     def payload(self) -> bytes:
@@ -128,6 +124,17 @@ class PendingRequest:
         """Return the remaining time [s]."""
         return self.begun_s + self.timeout_s - now_s
 
+    @property
+    def _unavailable(self) -> ServiceUnavailableError:
+        """Error of a request for which no coordinator was found in time."""
+        awaited = f"no coordinator has answered at {self.network} within {self.timeout_s:g} s"
+        return ServiceUnavailableError(awaited)
+
+    @property
+    def unanswered(self) -> TimeoutError:
+        """Error of a request that a coordinator has received and did not answer in time."""
+        return TimeoutError(f"no plan from {self.network} within {self.timeout_s:g} s")
+
     def after(self, answer: Answer | None, now_s: float) -> PlanResponse | float:
         """Return the plan in an answer, or the pause [s] before sending the request again.
 
@@ -135,14 +142,19 @@ class PendingRequest:
             PlanError: there will be no plan.
         """
         if answer is None:
-            return self._after_silence(now_s)
-        self._absent_since_s = None
+            # A coordinator may start at any moment, so the last attempt is just before the end.
+            left_s = self.left_s(now_s) - FIRST_PAUSE_S
+            if left_s <= 0:
+                raise self._unavailable
+            return min(self._next_pause_s(), left_s)
         if answer.ok:
             return self._read(answer)
         refusal = self._refusal(answer)
         if refusal.code == OVERLOADED:
-            overloaded = ServiceOverloadedError(refusal.message)
-            return self._pause(now_s, overloaded, refusal.retry_after_s or 0.0)
+            pause_s = max(self._next_pause_s(), refusal.retry_after_s or 0.0)
+            if self.left_s(now_s) <= pause_s:
+                raise ServiceOverloadedError(refusal.message)
+            return pause_s
         if refusal.code == INVALID:
             raise RequestRefusedError(refusal.message, refusal.field)
         if refusal.code == LATE:
@@ -151,20 +163,8 @@ class PendingRequest:
             raise RequestCancelledError(refusal.message)
         raise PlanningFailedError(refusal.message)
 
-    def _after_silence(self, now_s: float) -> float:
-        since_s = now_s if self._absent_since_s is None else self._absent_since_s
-        self._absent_since_s = since_s
-        absent = ServiceUnavailableError("no coordinator answers on this network and realm")
-        if now_s >= since_s + self.patience_s:
-            raise absent
-        return self._pause(now_s, absent)
-
-    def _pause(self, now_s: float, otherwise: PlanError, min_s: float = 0.0) -> float:
-        """Return the next, longer pause; raise `otherwise` if no time is left for it."""
+    def _next_pause_s(self) -> float:
         pause_s, self._pause_s = self._pause_s, min(2 * self._pause_s, LONGEST_PAUSE_S)
-        pause_s = max(pause_s, min_s)
-        if self.left_s(now_s) <= pause_s:
-            raise otherwise
         return pause_s
 
     @staticmethod
@@ -214,18 +214,17 @@ def _token_key(access: Access, keys: Keys) -> str:
 class _Connection:
     """A session with a router, its liveliness token, and the keys of the service."""
 
-    def __init__(self, access: Access | str, patience_s: float = ABSENT_S) -> None:
+    def __init__(self, access: Access | str) -> None:
         """Connect.
 
         Args:
             access: access to the network, or just the endpoint of its router.
-            patience_s: time without any answer after which the service counts as absent.
 
         Raises:
             BadInputError: no router answers there.
         """
         access = Access(access) if isinstance(access, str) else access
-        self._patience_s = patience_s
+        self._network = f"{access.endpoint}, realm {access.realm},"
         keys = Keys(access.realm)
         self._key = keys.key(SERVICE)
         self._cancel_key = keys.key(SERVICE_CANCEL)
@@ -250,10 +249,14 @@ class _Connection:
         """Provide a request to send; cancel it if the block ends without an answer."""
         if not request.id:
             request = attrs.evolve(request, id=uuid.uuid4().hex)
+        pending = PendingRequest(request, timeout_s, time.monotonic(), self._network)
         try:
-            yield PendingRequest(request, timeout_s, time.monotonic(), patience_s=self._patience_s)
+            yield pending
         except PlanError:
             raise
+        except TimeoutError:
+            self.cancel(request.id)
+            raise pending.unanswered from None
         except BaseException:
             self.cancel(request.id)
             raise
@@ -279,16 +282,17 @@ class PlanClient(_Connection):
 
         Args:
             request: the request; if it has no id, it gets one.
-            timeout_s: timeout for all attempts together.
+            timeout_s: timeout for all attempts together; a coordinator may start meanwhile.
 
         Raises:
             RequestRefusedError: the request is not valid.
-            ServiceUnavailableError: there is no coordinator, or this client is closed.
+            ServiceUnavailableError: no coordinator has answered within `timeout_s`, or this client
+                is closed.
             ServiceOverloadedError: the coordinators were overloaded at every attempt.
             DeadlinePassedError: no worker was free before the request's deadline.
             RequestCancelledError: the request was cancelled.
             PlanningFailedError: an error occurred in the service.
-            TimeoutError: no answer within `timeout_s`.
+            TimeoutError: a coordinator has the request, and has not answered within `timeout_s`.
         """
         with self._pending(request, timeout_s) as pending:
             while True:

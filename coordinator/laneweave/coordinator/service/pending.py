@@ -77,9 +77,11 @@ class PendingPlans:
 
     def __len__(self) -> int:
         """Return the number of requests that still need an answer."""
-        return len(list(self._unanswered()))
+        return len(list(self.unanswered))
 
-    def _unanswered(self) -> Iterator[PendingPlan]:
+    @property
+    def unanswered(self) -> Iterator[PendingPlan]:
+        """Requests that still need an answer."""
         yield from (entry for entry in self._planning.values() if not entry.dropped)
         yield from self._waiting
 
@@ -104,18 +106,18 @@ class PendingPlans:
         """Return the requests for which a session waits."""
         return [
             entry
-            for entry in self._unanswered()
+            for entry in self.unanswered
             if any(query.session == session for query in entry.queries)
         ]
 
     def count(self, client: str) -> int:
         """Return the number of a client's requests that still need an answer."""
-        return sum(entry.client == client for entry in self._unanswered())
+        return sum(entry.client == client for entry in self.unanswered)
 
     @property
     def clients(self) -> int:
         """Number of clients with pending requests."""
-        return len({entry.client for entry in self._unanswered()})
+        return len({entry.client for entry in self.unanswered})
 
     def owns(self, job: int) -> bool:
         """Return whether a computation belongs to a request."""

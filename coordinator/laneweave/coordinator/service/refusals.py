@@ -87,6 +87,12 @@ class PacedRefusals:
             yield heapq.heappop(self._held).reply(now_s)
         yield from self.release(now_s)
 
+    def withdraw(self) -> list[OpenQuery]:
+        """Remove and return the queries whose refusals are held back."""
+        queries = [held.query for held in self._held]
+        self._held.clear()
+        return queries
+
     def release(self, now_s: float) -> Iterator[Reply]:
         """Send the refusals that are due."""
         while self._held and self._held[0].due_s <= now_s:

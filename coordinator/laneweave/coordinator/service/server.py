@@ -66,7 +66,7 @@ class ServiceMetrics:
     ABOUT: ClassVar[str] = "service"
 
     taken_total: int = metric("Requests assigned to this coordinator", default=0)
-    left_total: int = metric("Requests assigned to other coordinators", default=0)
+    left_total: int = metric("Requests left to other coordinators", default=0)
     answered_total: int = metric("Requests answered", default=0)
     repeated_total: int = metric(
         "Requests repeated (same id) while they were pending, and planned once", default=0
@@ -121,6 +121,8 @@ class PlanningService:
         self._mean_s = FIRST_MEAN_S
         """Mean time of recent plans."""
         self._refusals = PacedRefusals()
+        self._retired = False
+        """Whether new requests are left to other coordinators."""
         self._metrics = ServiceMetrics()
 
     @property
@@ -151,7 +153,8 @@ class PlanningService:
     ) -> Iterator[Effect]:
         """Accept a request, decline it, or refuse it.
 
-        Requests of other coordinators and of clients that are gone are declined.
+        Requests of other coordinators and of clients that are gone are declined, and all requests
+        after `retire`.
 
         Args:
             token: token of the query.
@@ -162,7 +165,7 @@ class PlanningService:
             others: names of the other live coordinators.
             now_s: node clock.
         """
-        if not is_assigned_to(self._name, others, payload):
+        if self._retired or not is_assigned_to(self._name, others, payload):
             self._count("left_total")
             yield Decline(token)
             return
@@ -306,6 +309,23 @@ class PlanningService:
     def _forget(self, entry: PendingPlan) -> None:
         """Remove a request from those known by id."""
         self._by_id.pop(entry.request.id, None)
+
+    # --- the end ------------------------------------------------------------------------------
+
+    @property
+    def idle(self) -> bool:
+        """Whether all requests have been answered."""
+        return len(self._pending) == 0
+
+    def retire(self) -> Iterator[Effect]:
+        """Leave new requests to other coordinators, and those that would only be refused."""
+        self._retired = True
+        yield from (Decline(query.token) for query in self._refusals.withdraw())
+
+    def give_up(self) -> Iterator[Effect]:
+        """Leave all pending requests to other coordinators: this process ends."""
+        for entry in self._pending.unanswered:
+            yield from (Decline(query.token) for query in entry.queries)
 
     # --- planning -----------------------------------------------------------------------------
 

@@ -201,7 +201,6 @@ def _table(request: PlanRequest, response: PlanResponse) -> str:
 
 def _ask(access: Access, request: PlanRequest, wait_s: float) -> PlanResponse:
     from laneweave.coordinator.service.client import (
-        ABSENT_S,
         PlanClient,
         PlanError,
         RequestRefusedError,
@@ -211,11 +210,12 @@ def _ask(access: Access, request: PlanRequest, wait_s: float) -> PlanResponse:
     timeout_s = request.deadline_s + ANSWER_MARGIN_S + wait_s
     access = attrs.evolve(access, connect_timeout_s=max(wait_s, access.connect_timeout_s))
     try:
-        with PlanClient(access, max(ABSENT_S, wait_s)) as client:
+        with PlanClient(access) as client:
             return client.plan(request, timeout_s)
     except RequestRefusedError as error:
         raise RefusedError(str(error)) from error
     except ServiceUnavailableError as error:
-        raise BadInputError("--connect", access.endpoint, "a network with a coordinator") from error
+        allowed = f"a network on which a coordinator answers within {timeout_s:g} s"
+        raise BadInputError("--connect", access.endpoint, allowed) from error
     except (PlanError, TimeoutError) as error:
         raise CommandFailedError(f"{access.endpoint}: {error}") from error

@@ -38,6 +38,12 @@ from laneweave.protocol.security.access_control import access_of
 
 log = structlog.get_logger(__name__)
 
+DRAIN_S = 5.0
+"""Default of `--drain`: longer than the default deadline of a request (4 s), and with the time to
+exit shorter than the 10 s after which container engines kill a process."""
+MAX_DRAIN_S = 3600.0
+"""Longest deadline of a request."""
+
 
 def router(
     config: Config = None,
@@ -77,6 +83,15 @@ def coordinator(
         str, typer.Option("--name", help="The coordinator with the lowest name leads.")
     ] = "c1",
     solver: Solver = None,
+    drain: Annotated[
+        float,
+        typer.Option(
+            "--drain",
+            metavar="SECONDS",
+            help="Time after SIGTERM or Ctrl-C to answer pending plan requests; a second signal "
+            "ends at once.",
+        ),
+    ] = DRAIN_S,
     metrics: Metrics = None,
     log_format: Log = LogFormat.text,
     log_level: Level = None,
@@ -88,12 +103,14 @@ def coordinator(
 
     if not NAME_PATTERN.fullmatch(name):
         raise BadInputError("--name", name, NAME_RULE)
+    if not 0.0 <= drain <= MAX_DRAIN_S:
+        raise BadInputError("--drain", drain, f"[0, {MAX_DRAIN_S:g}]")
     settings = load_deployment(
         config, endpoint, observation__metrics=metrics, formation__solver=solver
     )
     checked_solver(settings.formation.solver, "formation.solver")
     with _as_role("coordinator", name, settings, log_format, log_level) as observe:
-        run_coordinator(settings, name, observe=observe, fork_workers=True)
+        run_coordinator(settings, name, observe=observe, fork_workers=True, grace_s=drain)
 
 
 def agent(

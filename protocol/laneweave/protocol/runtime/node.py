@@ -117,7 +117,10 @@ class QueryArrived:
 
 @frozen
 class Stopping:
-    """Last event of a core: the process is about to exit."""
+    """The process is about to exit; with a grace, as soon as the core returns `End`."""
+
+    grace_s: float = 0.0
+    """Time to finish what has begun [s]; 0: this is the core's last event."""
 
 
 Event = (
@@ -379,8 +382,7 @@ class Node:
 
     def _query_event(self, query: Query) -> QueryArrived:
         topic, _ = known_key(self._keys, query.key)
-        known = self._keys.read(query.sender)
-        sender = {} if known is None else known[1]
+        _, sender = self._keys.read(query.sender) or (None, {})
         return QueryArrived(query.token, query.payload, query.encoding, topic, sender)
 
     def _on_skipped(self, fields: int) -> None:

@@ -2,12 +2,13 @@
 
 One thread per worker sends the next job to its process and waits until the result arrives, the
 process dies, or the deadline has been exceeded by `OVERDUE_S`. In the last two cases the process is
-replaced; no other job is affected. (The pools of the standard library and of pebble fail completely
-when an idle worker is killed.)
+replaced (`fork_server`); no other job is affected. (The pools of the standard library and of pebble
+fail completely when an idle worker is killed.)
 
 A job is stopped through its clock: the number of the job to stop is in memory that the pool shares
-with the process, and the clock compares it at each reading. A process whose job does not read the
-clock within `STOP_S` is killed.
+with the process, and the clock compares it at each reading. A process whose job does not end within
+`STOP_S` is replaced, which takes less time than many planners need to read the clock, or to free
+their memory.
 """
 
 from __future__ import annotations
@@ -18,17 +19,16 @@ import math
 import multiprocessing
 import os
 import queue
-import signal
 import threading
 import time
 from collections.abc import Callable
+from functools import partial
 from multiprocessing.connection import Connection
-from multiprocessing.context import ForkContext, SpawnContext
-from multiprocessing.process import BaseProcess
 
 import structlog
 from attrs import define
 
+from laneweave.protocol.runtime.fork_server import END_S, ForkServer
 from laneweave.protocol.runtime.node import (
     STOPPED,
     Clock,
@@ -38,26 +38,20 @@ from laneweave.protocol.runtime.node import (
     error_text,
     run_delegated,
 )
-from laneweave.protocol.runtime.processes import die_with_parent
 
 log = structlog.get_logger(__name__)
 
 OVERDUE_S = 5.0
 """Time by which a worker may exceed the deadline of its job before it is killed."""
-STOP_S = 0.5
-"""Time after which a worker is killed if its job does not stop."""
+STOP_S = 0.05
+"""Time after which a worker is replaced if its job does not stop."""
 NICENESS = 5
 """Increase of a worker's niceness: the processes that all others wait for take priority."""
-END_S = 2.0
-"""Maximum wait for a killed process to exit."""
 CHECK_S = 1.0
 """Interval at which an idle thread checks that its process is alive."""
 PAUSE_S = 0.5
-"""Delay before replacing a process that died within this time of its start, so that repeated
-failures do not load the machine."""
-
-_SPAWN = multiprocessing.get_context("spawn")
-_FORK = multiprocessing.get_context("fork")
+"""Delay before replacing a process that died by itself within this time of its start, so that
+repeated failures do not load the machine."""
 
 
 @define(eq=False)
@@ -72,15 +66,21 @@ class _Order:
 class WorkerPool:
     """Pool of worker processes, which die with their parent."""
 
-    def __init__(self, workers: int, warm_up: Callable[[], None] | None = None) -> None:
+    def __init__(self, workers: int, warm_up: Callable[[], object] | None = None) -> None:
         """Create the pool; processes start at the first call of `submit` or `fork`.
 
         Args:
             workers: maximum number of concurrent jobs.
-            warm_up: picklable function that each worker calls when it starts, unless it is a fork.
+            warm_up: picklable function that loads what jobs need; see `ForkServer`.
         """
         self._queue: queue.SimpleQueue[_Order | None] = queue.SimpleQueue()
-        self._workers = [_Worker(self._queue, warm_up) for _ in range(workers)]
+        # Shared memory of any start method.
+        jobs_to_stop = multiprocessing.get_context("spawn").RawArray(ctypes.c_int64, workers)
+        jobs_to_stop[:] = [-1] * workers
+        self._server = ForkServer(workers, partial(_work, jobs_to_stop), warm_up)
+        self._workers = [
+            _Worker(number, self._queue, self._server, jobs_to_stop) for number in range(workers)
+        ]
         self._orders: dict[int, _Order] = {}
         """Orders without a result, by the number of the job."""
         self._started = False
@@ -88,27 +88,26 @@ class WorkerPool:
     @property
     def process_ids(self) -> list[int]:
         """Process ids of the running workers."""
-        return [worker.process_id for worker in self._workers if worker.process_id]
+        return self._server.process_ids
 
     def fork(self) -> None:
-        """Start the workers as forks of this process, which must have called `warm_up`.
+        """Start the workers as forks of this process, which has loaded what they need.
 
-        Must be called before this process opens Zenoh, and before `submit`: a fork would inherit
-        the sockets and locked state of Zenoh. Workers that replace others are not forks.
+        Must be called before this process opens Zenoh, and before `submit`; see `ForkServer.start`.
         """
-        for worker in self._workers:
-            worker.start_process(_FORK)
-        self._start_threads()
+        self._start(fork=True)
 
-    def _start_threads(self) -> None:
+    def _start(self, *, fork: bool = False) -> None:
         if not self._started:
             self._started = True
+            with contextlib.suppress(OSError):  # tried again, and reported, for each worker
+                self._server.start(fork=fork)
             for worker in self._workers:
                 worker.thread.start()
 
     def submit(self, job: Delegate, done: Callable[[Computed], None]) -> None:
         """Queue a job; `done` is called from a worker's thread."""
-        self._start_threads()
+        self._start()
 
         def finish(computed: Computed) -> None:
             self._orders.pop(computed.job, None)
@@ -132,6 +131,7 @@ class WorkerPool:
         """Kill the workers and discard the results of their jobs."""
         for worker in self._workers:
             worker.end()
+        self._server.close()
         for _ in self._workers:
             self._queue.put(None)
         if self._started:
@@ -143,59 +143,54 @@ class _Worker:
     """A thread that manages one process at a time."""
 
     def __init__(
-        self, orders: queue.SimpleQueue[_Order | None], warm_up: Callable[[], None] | None
+        self,
+        number: int,
+        orders: queue.SimpleQueue[_Order | None],
+        server: ForkServer,
+        jobs_to_stop: ctypes.Array[ctypes.c_int64],
     ) -> None:
+        self._number = number
         self._orders = orders
+        self._server = server
         self._order: _Order | None = None
         """Current order."""
-        self._job_to_stop = _SPAWN.RawValue(ctypes.c_int64, -1)
-        """Number of the newest job to stop, in shared memory."""
-        self._warm_up = warm_up
+        self._jobs_to_stop = jobs_to_stop
+        """Number of the newest job to stop of each worker, in shared memory."""
         self._lock = threading.Lock()
         self._ending = threading.Event()
-        self._process: BaseProcess | None = None
         self._connection: Connection | None = None
         self._started_s = -math.inf
+        """Start of the process, unless the pool has killed it."""
         self.thread = threading.Thread(target=self._run_jobs, name="worker", daemon=True)
 
-    @property
-    def process_id(self) -> int:
-        """Process id; 0 if there is no process."""
-        process = self._process
-        return 0 if process is None or process.pid is None else process.pid
-
     def end(self) -> None:
-        """Kill the process and end the thread."""
+        """End the thread when the process has exited."""
         with self._lock:
             self._ending.set()
-            process = self._process  # the thread may reset it concurrently
-            if process is not None:
-                process.kill()
 
     def stop(self, order: _Order) -> None:
         """Stop an order if it is the current one; kill the process if that takes too long."""
         if self._order is order:
-            self._job_to_stop.value = order.job.job
+            self._jobs_to_stop[self._number] = order.job.job
             timer = threading.Timer(STOP_S, self._kill_if_running, (order,))
             timer.daemon = True
             timer.start()
 
     def _kill_if_running(self, order: _Order) -> None:
         with self._lock:
-            process = self._process
-            if self._order is order and process is not None:
-                log.warning("a worker was killed: its job did not stop", job=order.job.job)
-                process.kill()
+            if self._order is order and not self._ending.is_set():
+                log.info("a worker is replaced: its job did not stop", job=order.job.job)
+                self._started_s = -math.inf
+                self._server.kill(self._number)
 
     def _run_jobs(self) -> None:
-        if self._process is None:
-            self.start_process()
+        self._start_process()
         while not self._ending.is_set():
             try:
                 order = self._orders.get(timeout=CHECK_S)
             except queue.Empty:
-                if self._process is None or not self._process.is_alive():
-                    self.start_process()
+                if self._connection is None or self._connection.poll():  # the end of the process
+                    self._start_process()
                 continue
             if order is None:
                 break
@@ -203,7 +198,7 @@ class _Worker:
             if not self._ending.is_set():
                 order.done(result)
                 if self._connection is None:
-                    self.start_process()
+                    self._start_process()
         self._discard_process()
 
     def _result_of(self, order: _Order) -> Computed:
@@ -220,7 +215,7 @@ class _Worker:
             with self._lock:
                 self._order = None
 
-    def start_process(self, context: SpawnContext | ForkContext = _SPAWN) -> Connection | None:
+    def _start_process(self) -> Connection | None:
         """Start a process, replacing the previous one.
 
         Returns:
@@ -234,8 +229,7 @@ class _Worker:
                 return None
             self._started_s = time.monotonic()
             try:
-                warm_up = self._warm_up if context is _SPAWN else None
-                self._process, self._connection = _start(context, warm_up, self._job_to_stop)
+                self._connection = self._server.fork(self._number)
             except OSError as error:
                 log.warning("a worker cannot be started", reason=str(error))
             return self._connection
@@ -245,10 +239,7 @@ class _Worker:
         if self._connection is not None:
             self._connection.close()
             self._connection = None
-        if self._process is not None:
-            self._process.kill()
-            self._process.join(END_S)
-            self._process = None
+            self._server.kill(self._number)
 
     def _run(self, order: _Order) -> Computed:
         """Run a job unless it is stopped; retry once in a new process if the worker dies."""
@@ -256,7 +247,7 @@ class _Worker:
         for _ in range(2):
             if order.stopped:
                 return Computed(job.job, None, STOPPED)
-            connection = self._connection or self.start_process()
+            connection = self._connection or self._start_process()
             done = None if connection is None else self._try_once(connection, job)
             if done is not None:
                 return done
@@ -285,42 +276,17 @@ class _Worker:
         return Computed(job.job, None, "the worker was killed: it exceeded its deadline")
 
 
-def _start(
-    context: SpawnContext | ForkContext,
-    warm_up: Callable[[], None] | None,
-    job_to_stop: ctypes.c_int64,
-) -> tuple[BaseProcess, Connection]:
-    ours, theirs = context.Pipe()
-    with theirs:
-        arguments = theirs, warm_up, job_to_stop
-        process = context.Process(target=_work, args=arguments, name="worker", daemon=True)
-        try:
-            process.start()
-        except OSError:
-            ours.close()
-            raise
-    return process, ours
-
-
-def _work(
-    connection: Connection, warm_up: Callable[[], None] | None, job_to_stop: ctypes.c_int64
-) -> None:
+def _work(jobs_to_stop: ctypes.Array[ctypes.c_int64], number: int, connection: Connection) -> None:
     """Run jobs until the parent closes its connection; main function of a worker process."""
-    # These signals reach the whole process group, but the parent stops its workers itself.
-    for number in (signal.SIGINT, signal.SIGHUP):
-        signal.signal(number, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)
     os.nice(NICENESS)
-    parent = multiprocessing.parent_process()
-    die_with_parent(None if parent is None else parent.pid)
-    if warm_up is not None:
-        warm_up()
     with contextlib.suppress(EOFError, OSError):
         while True:
-            _run_next(connection, job_to_stop)
+            _run_next(jobs_to_stop, number, connection)
 
 
-def _run_next(connection: Connection, job_to_stop: ctypes.c_int64) -> None:
+def _run_next(
+    jobs_to_stop: ctypes.Array[ctypes.c_int64], number: int, connection: Connection
+) -> None:
     """Run one job.
 
     Raises:
@@ -329,7 +295,8 @@ def _run_next(connection: Connection, job_to_stop: ctypes.c_int64) -> None:
     try:
         # `time.monotonic` reads the same clock in all processes of a machine.
         job = connection.recv()
-        computed = run_delegated(job, time.monotonic, _stoppable_clock(job.job, job_to_stop))
+        clock = _stoppable_clock(job.job, number, jobs_to_stop)
+        computed = run_delegated(job, time.monotonic, clock)
         connection.send((computed.result, computed.error))
     except (EOFError, OSError):
         raise
@@ -338,11 +305,11 @@ def _run_next(connection: Connection, job_to_stop: ctypes.c_int64) -> None:
         connection.send((None, error_text(error)))
 
 
-def _stoppable_clock(job: int, job_to_stop: ctypes.c_int64) -> Clock:
+def _stoppable_clock(job: int, number: int, jobs_to_stop: ctypes.Array[ctypes.c_int64]) -> Clock:
     """Return `time.monotonic`, except that it raises `StoppedError` when the job is to stop."""
 
     def clock() -> float:
-        if job_to_stop.value == job:
+        if jobs_to_stop[number] == job:
             raise StoppedError
         return time.monotonic()
 

@@ -1,4 +1,4 @@
-"""Bounds of received numbers: terms, incarnations, road times and ticks.
+"""Bounds of received numbers: terms, incarnations, road times, ticks, and counters of others.
 
 Malformed messages are refused by the codec. A well-formed message may still contain a number that
 no correct sender has, such as a term of 2^63 - 1, above which no leader can go. Each role refuses
@@ -9,6 +9,7 @@ repeat are forgotten (`newest`). Safety depends on neither: a refused message is
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Iterable
 
 from attrs import define
@@ -25,6 +26,7 @@ from laneweave.protocol.wire.messages import (
     VehicleState,
 )
 from laneweave.protocol.wire.newest import AHEAD_S
+from laneweave.protocol.wire.process_messages import Report
 
 MAX_TERM_AT_START = 200_000
 """Maximum term of a ballot at road time 0."""
@@ -46,6 +48,17 @@ AHEAD_NS = 2 * DAY_NS
 accept what the bridge has accepted."""
 SUCCESSION_NS = 10**9
 """Maximum lead of a claim over the process in charge, if the latter is itself near the limit."""
+MAX_MESSAGES_PER_S = 100_000
+"""Maximum mean rate of the messages that a process publishes or receives: a process needs about
+10 us to encode or decode one."""
+MAX_AGE_S = 86_400.0
+"""Time for which a process may have had that rate before the receiver started. At the 50 messages
+per second of a coordinator, this is more than five years."""
+MAX_SOLVES_PER_TICK = 2
+"""An agent solves once in each tick, and again if it has been misled about the time."""
+MAX_SOLVE_MS = 60_000.0
+"""Maximum CPU time of one solve, whose iterations are limited; usually it is a few milliseconds."""
+_DURATION = struct.Struct("<f")
 
 
 def max_term(road_s: float) -> int:
@@ -76,9 +89,13 @@ class Bounds:
 
     def max_incarnation(self, now_s: float, ahead_ns: int = AHEAD_NS) -> int:
         """Return the maximum incarnation at a time on the node's clock."""
+        return self.incarnation + ahead_ns + int(self._age_s(now_s) * 1e9)
+
+    def _age_s(self, now_s: float) -> float:
+        """Return the time since the first check."""
         if self._since_s is None:
             self._since_s = now_s
-        return self.incarnation + ahead_ns + int((now_s - self._since_s) * 1e9)
+        return now_s - self._since_s
 
     def check_incarnation(self, incarnation: int, now_s: float) -> None:
         """Check the incarnation of a process.
@@ -123,6 +140,8 @@ class Bounds:
             case Heartbeat():
                 self.check_incarnation(message.incarnation, now_s)
                 _check_term(message.term, road_s)
+            case Report():
+                self._check_report(message, road_s, now_s)
             case _:
                 pass
 
@@ -145,6 +164,22 @@ class Bounds:
         for ballot in (record.promised, record.accepted, transfer):
             if ballot is not None:
                 check_ballot(ballot, road_s)
+
+    def _check_report(self, report: Report, road_s: float, now_s: float) -> None:
+        messages = int(MAX_MESSAGES_PER_S * (MAX_AGE_S + self._age_s(now_s)))
+        solves = MAX_SOLVES_PER_TICK * (int(road_s / self.tick_s) + 1)
+        _check_count("published", report.published, messages)
+        _check_count("rejected", report.rejected, messages)
+        _check_count("solves", report.solves, solves)
+        _check_count("unusable", report.unusable, report.solves)
+        _check_count("osqp_solves", report.osqp_solves, report.solves)
+        size = len(report.solve_ms)
+        if size % _DURATION.size or size > _DURATION.size * report.solves:
+            allowed = f"at most {report.solves} durations of {_DURATION.size} bytes"
+            raise BadInputError("solve_ms", f"{size} bytes", allowed)
+        for (duration_ms,) in _DURATION.iter_unpack(report.solve_ms):
+            if not 0.0 <= duration_ms <= MAX_SOLVE_MS:
+                raise BadInputError("solve_ms", duration_ms, f"0 to {MAX_SOLVE_MS:g}")
 
     def _check_time(self, t_s: float, road_s: float) -> None:
         limit_s = road_s + self.tick_s
@@ -171,6 +206,11 @@ def check_ballot(ballot: Ballot, road_s: float) -> None:
 def _check_term(term: int, road_s: float) -> None:
     if not 0 <= term <= max_term(road_s):
         raise BadInputError("term", term, f"0 to {max_term(road_s)}")
+
+
+def _check_count(name: str, count: int, limit: int) -> None:
+    if not 0 <= count <= limit:
+        raise BadInputError(name, count, f"0 to {limit}")
 
 
 def blocks_in_range(blocks: Iterable[int]) -> bool:

@@ -58,8 +58,9 @@ class Report(Message, frozen=True):
     Sent by agents when their vehicle has left or they are stopped, by the bridge when its run ends,
     and by coordinators every 2 s and when they are stopped. Missing: not included in the
     summary; when a run ends, the bridge waits up to 2 s for the reports from all agents. Late: not
-    recorded. Duplicated: the newest report from a sender counts. The summary takes the maximum of
-    `published` and of `rejected` over the senders of a process, and sums all other counters.
+    recorded. Duplicated: the newest report from a sender counts. Impossible numbers: refused. The
+    summary takes the maximum of `published` and of `rejected` over the senders of a process, and
+    sums all other counters.
     """
 
     role: Name

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from contextlib import suppress
 from itertools import pairwise
 from typing import Any
 
@@ -16,7 +17,6 @@ from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.coordinator.planning.response import PlanResponse
 from laneweave.coordinator.planning.solve import plan
 from laneweave.coordinator.service.client import (
-    ABSENT_S,
     FIRST_PAUSE_S,
     LONGEST_PAUSE_S,
     DeadlinePassedError,
@@ -55,7 +55,7 @@ FORMATS = pytest.mark.parametrize("form", [JSON, MSGPACK], ids=["JSON", "Message
 
 
 def inquiry(timeout_s: float = 10.0) -> PendingRequest:
-    return PendingRequest(REQUEST, timeout_s, START_S)
+    return PendingRequest(REQUEST, timeout_s, START_S, "tcp/router:7447, realm default,")
 
 
 def refusal(**data: object) -> Answer:
@@ -153,20 +153,36 @@ def given_up_s(error: BaseException) -> float:
     return float(error.__notes__[0].removeprefix("at ")) - START_S
 
 
-@pytest.mark.parametrize("patience_s", [ABSENT_S, 20.0])
-def test_without_answers_for_long_there_is_no_service(patience_s: float) -> None:
-    asked = PendingRequest(REQUEST, 60.0, START_S, patience_s=patience_s)
+@pytest.mark.parametrize("answers", [[None], [*4 * [None], OVERLOAD, None]])
+@pytest.mark.parametrize("timeout_s", [2.0, 20.0, 60.0])
+def test_a_client_waits_for_a_coordinator_until_its_own_deadline(
+    answers: list[Answer | None], timeout_s: float
+) -> None:
     with pytest.raises(ServiceUnavailableError) as caught:
-        after_pauses(asked, [None])
-    assert patience_s <= given_up_s(caught.value) <= patience_s + LONGEST_PAUSE_S + 0.02
+        after_pauses(inquiry(timeout_s), answers)
+    assert timeout_s - FIRST_PAUSE_S <= given_up_s(caught.value) <= timeout_s + 0.002
+    assert str(caught.value) == (
+        f"no coordinator has answered at tcp/router:7447, realm default, within {timeout_s:g} s"
+    )
 
 
-def test_an_answer_shows_that_there_is_a_service() -> None:
-    # Silence, an answer, silence: absence counts from the last one.
-    with pytest.raises(ServiceUnavailableError) as caught:
-        after_pauses(inquiry(60.0), [*4 * [None], OVERLOAD, None])
-    whole_s = FIRST_PAUSE_S * (1 + 2 + 4 + 8 + 16)
-    assert given_up_s(caught.value) >= ABSENT_S + whole_s
+def test_a_coordinator_that_starts_shortly_before_the_deadline_is_asked() -> None:
+    asked, now_s = inquiry(20.0), START_S
+    attempts_s = []
+    with suppress(ServiceUnavailableError):
+        while True:
+            attempts_s.append(now_s)
+            pause_s = asked.after(None, now_s)
+            assert isinstance(pause_s, float)
+            now_s += pause_s
+    assert attempts_s[-1] == pytest.approx(START_S + 20.0 - FIRST_PAUSE_S)
+    assert max(after - before for before, after in pairwise(attempts_s)) <= LONGEST_PAUSE_S + 1e-9
+
+
+def test_a_timeout_says_what_was_awaited() -> None:
+    assert str(inquiry(20.0).unanswered) == (
+        "no plan from tcp/router:7447, realm default, within 20 s"
+    )
 
 
 @pytest.mark.parametrize(

@@ -108,6 +108,10 @@ class Desk:
         self.now_s += seconds
         self._note(self.service.wake(self.now_s))
 
+    def retire(self) -> None:
+        """Begin the end of the process."""
+        self._note(self.service.retire())
+
     def leave(self, session: ClientSession) -> None:
         """End a client's session."""
         self._note(self.service.close_session(session))
@@ -510,6 +514,22 @@ def test_held_refusals_do_not_use_up_all_open_queries() -> None:
     assert len(held) == refusals.MAX_HELD
     desk.wait(refusals.MAX_RETRY_S)
     assert set(held) <= set(desk.replies)
+
+
+def test_a_service_that_ends_leaves_requests_that_it_would_refuse_to_others() -> None:
+    desk = make_desk(client_queue_limit=1)
+    flood = opened(desk, "flood")
+    pending = desk.ask(REQUEST, session=flood)
+    tokens = [desk.ask(REQUEST, session=flood) for _ in range(refusals.PROMPT + 5)]
+    held = [token for token in tokens if token not in desk.replies]
+    assert len(held) == 5
+    desk.retire()
+    assert desk.left == held
+    assert desk.ask(REQUEST) in desk.left
+    assert not desk.service.idle
+    desk.work()
+    assert desk.answer(pending)["status"] == "optimal"
+    assert desk.service.idle
 
 
 def answered_in(desk: Desk, solve_ms: float) -> None:

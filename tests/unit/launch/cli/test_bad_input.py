@@ -66,6 +66,8 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         (["agent", "--endpoint", NOBODY, "--shard", "2/2"], "--shard: got '2/2'"),
         (["agent", "--endpoint", NOBODY, "*"], "VEHICLE: got '*'"),
         (["coordinator", "--endpoint", NOBODY, "--name", "c/1"], "--name: got 'c/1'"),
+        (["coordinator", "--endpoint", NOBODY, "--drain", "-1"], "--drain: got -1.0"),
+        (["coordinator", "--endpoint", NOBODY, "--drain", "nan"], "--drain: got nan"),
         (["coordinator", "--endpoint", NOBODY, "--solver", "magic"], "formation.solver: got"),
         (["bench", "planner", "--solver", "magic"], "--solver: got 'magic'"),
         (["report"], "DIR"),

@@ -18,7 +18,7 @@ from typing import Any
 import psutil
 import pytest
 
-from laneweave.protocol.runtime import worker_pool
+from laneweave.protocol.runtime import fork_server, worker_pool
 from laneweave.protocol.runtime.node import STOPPED, Clock, Computed, Delegate
 from laneweave.protocol.runtime.worker_pool import WorkerPool
 from support import worker_jobs as jobs
@@ -34,9 +34,9 @@ WAIT_S = 60.0
 class Bench:
     """A pool, and what has come of its jobs."""
 
-    def __init__(self, workers: int) -> None:
+    def __init__(self, workers: int, warm_up: Callable[[], object] | None = None) -> None:
         """Start nothing yet."""
-        self.pool = WorkerPool(workers)
+        self.pool = WorkerPool(workers, warm_up)
         self.done: queue.SimpleQueue[Computed] = queue.SimpleQueue()
         self._jobs = 0
 
@@ -222,17 +222,63 @@ def test_a_stopped_job_that_waits_is_not_begun(one: Bench, tmp_path: Path) -> No
     assert not jobs.noted(tmp_path / "begun")
 
 
-def test_a_worker_whose_job_does_not_stop_is_killed(
-    one: Bench, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def stop_after_begin(bench: Bench, file: Path) -> int:
+    """Stop a job that does not read its clock; return the process that had begun it."""
+    job = bench.order(partial(jobs.hang_at_first, file))
+    wait_until(lambda: len(jobs.noted(file)) == 1, WAIT_S)
+    bench.pool.stop(job)
+    assert bench.done.get(timeout=WAIT_S) == Computed(job, None, STOPPED)
+    (process,) = jobs.noted(file)
+    return process
+
+
+def is_reaped(process_id: int) -> bool:
+    return not psutil.pid_exists(process_id)
+
+
+def test_a_worker_whose_job_does_not_stop_is_killed(one: Bench, tmp_path: Path) -> None:
     before = one.process_id()
-    monkeypatch.setattr(worker_pool, "STOP_S", 0.05)
-    job = one.order(partial(jobs.hang_at_first, tmp_path / "begun"))
-    wait_until(lambda: jobs.noted(tmp_path / "begun") == [before], WAIT_S)
-    one.pool.stop(job)
-    assert one.done.get(timeout=WAIT_S) == Computed(job, None, STOPPED)
+    assert stop_after_begin(one, tmp_path / "begun") == before
     assert one.process_id() != before
     assert jobs.noted(tmp_path / "begun") == [before]
+
+
+def test_a_worker_that_replaces_another_is_ready_at_once(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    # An interpreter that starts, and what it loads, would delay the next client by a second or two.
+    bench = Bench(1, partial(jobs.note, tmp_path / "loaded"))
+    with contextlib.closing(bench.pool):
+        server = psutil.Process(bench.process_id()).ppid()
+        monkeypatch.setattr(fork_server._SPAWN.Process, "start", None)  # no other one can start
+        for number in range(3):
+            killed = stop_after_begin(bench, tmp_path / f"begun-{number}")
+            process = bench.process_id()
+            assert process != killed
+            assert psutil.Process(process).ppid() == server
+            wait_until(partial(is_reaped, killed), WAIT_S)
+    assert set(jobs.noted(tmp_path / "loaded")) == {server}
+
+
+def test_a_fork_server_that_is_killed_is_replaced(one: Bench) -> None:
+    before = one.process_id()
+    server = psutil.Process(before).ppid()
+    os.kill(server, signal.SIGKILL)
+    wait_until(lambda: is_gone(before), WAIT_S)
+    assert psutil.Process(one.process_id()).ppid() not in (server, 1, os.getpid())
+
+
+@pytest.mark.parametrize("fork", [False, True])
+def test_workers_outlive_a_signal_to_the_whole_group(*, fork: bool) -> None:
+    # The process that has the pool may still finish what is running.
+    bench = Bench(1)
+    with contextlib.closing(bench.pool):
+        if fork:
+            bench.pool.fork()
+        before = bench.process_id()
+        for process in (before, psutil.Process(before).ppid()):
+            os.kill(process, signal.SIGTERM)
+        assert bench.process_id() == before
 
 
 def test_stopping_a_complete_job_has_no_effect(one: Bench) -> None:
@@ -240,12 +286,6 @@ def test_stopping_a_complete_job_has_no_effect(one: Bench) -> None:
     before = one.done.get(timeout=WAIT_S).result
     one.pool.stop(job)
     one.pool.stop(job + 1)
-    assert one.process_id() == before
-
-
-def test_workers_ignore_ctrl_c(one: Bench) -> None:
-    before = one.process_id()
-    os.kill(before, signal.SIGINT)
     assert one.process_id() == before
 
 
@@ -258,7 +298,7 @@ def test_a_machine_that_gives_no_process_is_an_error_of_the_job(
     bench = Bench(1)
     with contextlib.closing(bench.pool):
         with monkeypatch.context() as patch:
-            patch.setattr(worker_pool._SPAWN.Process, "start", refuse)
+            patch.setattr(fork_server._SPAWN.Process, "start", refuse)
             assert bench.do(jobs.process_id).error == "the worker died"
         assert bench.process_id() in bench.pool.process_ids
 
@@ -270,7 +310,7 @@ def test_closing_waits_for_no_job(tmp_path: Path) -> None:
     bench = Bench(2)
     for _ in range(5):
         bench.order(partial(jobs.hang_at_first, tmp_path / "begun"))
-    wait_until(lambda: len(jobs.noted(tmp_path / "begun")) >= 1, WAIT_S)
+    wait_until(lambda: len(jobs.noted(tmp_path / "begun")) == 5, WAIT_S)
     processes = bench.pool.process_ids
 
     begun_s = time.monotonic()
@@ -323,14 +363,10 @@ def test_workers_die_with_the_process_that_has_the_pool(tmp_path: Path, *, fork:
         try:
             assert owner.stdout is not None
             workers = [int(word) for word in owner.stdout.readline().split()]
-            # A fork inherits what is loaded; a worker that replaces it must load it.
             assert len(set(workers)) == 2
-            assert sorted(jobs.noted(tmp_path / "warm")) == ([] if fork else sorted(workers))
-            if fork:
-                os.kill(workers[0], signal.SIGKILL)
-                wait_until(lambda: len(jobs.noted(tmp_path / "warm")) == 1, WAIT_S)
-                workers += jobs.noted(tmp_path / "warm")
+            # One process loads what all of them need, and is no worker.
+            warm = set(jobs.noted(tmp_path / "warm"))
+            assert len(warm - {*workers, owner.pid}) == len(warm) == 1
         finally:
             owner.kill()
-    assert len(set(workers)) == (3 if fork else 2)
-    wait_until(lambda: all(is_gone(worker) for worker in workers), WAIT_S)
+    wait_until(lambda: all(is_gone(each) for each in (*workers, *warm)), WAIT_S)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
+import numpy as np
 import pytest
 from msgspec.structs import replace
 
@@ -27,6 +29,7 @@ from laneweave.protocol.wire.messages import (
     RoadClock,
     VehicleRecord,
 )
+from laneweave.protocol.wire.process_messages import Report
 from support.states import A, changed, holding, sense_in
 from support.tables import for_each
 
@@ -42,7 +45,19 @@ BEAT = Heartbeat(Name("c2"), OWN, 3, leading=True, plans=1)
 STATE = holding(A, t_s=50.0, incarnation=OWN)
 SENSE = sense_in((0, 0), 500, incarnation=OWN, bridge=OWN)
 COMMAND = Command(A, VehicleRecord(OWN), 500, (0, 0), CurrentMotion((0, 0)), b"")
-POSSIBLE = (CLOCK, CENSUS, BEAT, STATE, SENSE, COMMAND)
+REPORT = Report(
+    *(Name("agent"), A, Name("1-2"), 10**6, 0),
+    solves=1000,
+    unusable=1,
+    osqp_solves=1000,
+    solve_ms=np.full(1000, 0.5, "<f4").tobytes(),
+)
+"""A process that has published for hours, and an agent that was there from the start."""
+POSSIBLE = (CLOCK, CENSUS, BEAT, STATE, SENSE, COMMAND, REPORT)
+
+
+def durations_ms(value: float, count: int = 1000) -> bytes:
+    return np.full(count, value, "<f4").tobytes()
 
 
 def bounds() -> Bounds:
@@ -85,6 +100,24 @@ def test_possible_numbers_pass(message: object) -> None:
         (COMMAND, {"promised": BALLOT}),
         (COMMAND, {"accepted": BALLOT}),
         (COMMAND, {"transfer": PendingTransfer(BALLOT)}),
+        *(
+            (REPORT, {name: number})
+            for name in ("published", "rejected", "solves", "unusable", "osqp_solves")
+            for number in (HUGE, 10**11, -1)
+        ),
+        (REPORT, {"solves": 2003}),
+        (REPORT, {"unusable": 1001}),
+        (REPORT, {"osqp_solves": 1001}),
+        (REPORT, {"solves": 999, "osqp_solves": 0}),
+        *(
+            (REPORT, {"solve_ms": packed})
+            for packed in (
+                *map(durations_ms, (-1.0, math.nan, math.inf, 1e30)),
+                durations_ms(0.5, 1001),
+                durations_ms(0.5)[:-1],
+                durations_ms(0.5, 999) + durations_ms(-0.1, 1),
+            )
+        ),
     ],
 )
 def test_impossible_numbers_are_refused(message: Any, changes: dict[str, Any]) -> None:  # noqa: ANN401
@@ -121,6 +154,23 @@ def test_counters_as_of_simulations_are_far_below_the_limits() -> None:
     made = Bounds(0, tick_s=0.1, max_road_s=1000.0)
     made.check(replace(BEAT, incarnation=10**6), 0.0, 0.0)
     made.check_claim(10**6, 0, 0.0)
+
+
+def test_the_limit_of_messages_moves_with_the_clock() -> None:
+    made, limit = bounds(), 100_000 * 86_400
+    for name in ("published", "rejected"):
+        made.check(replace(REPORT, **{name: limit}), ROAD_S, 7.0)
+        above = replace(REPORT, **{name: limit + 100_000})
+        with pytest.raises(BadInputError, match=name):
+            made.check(above, ROAD_S, 7.0)
+        made.check(above, ROAD_S, 8.0)
+
+
+def test_the_limit_of_solves_moves_with_the_road() -> None:
+    made, report = bounds(), replace(REPORT, solves=2 * 1101)
+    with pytest.raises(BadInputError, match="solves"):
+        made.check(report, ROAD_S, 7.0)
+    made.check(report, ROAD_S + 10.0, 7.0)
 
 
 def test_a_leader_can_soon_go_above_every_promise() -> None:

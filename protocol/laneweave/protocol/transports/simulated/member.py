@@ -120,7 +120,7 @@ class Member:
             self._backlog.append(item)
         else:
             self._process(item)
-            if isinstance(item, Stopping):
+            if isinstance(item, Stopping) and not item.grace_s:
                 self.transport.close()
             self._set_alarm()
 

@@ -189,11 +189,11 @@ class SimulatedNetwork(Simulation):
         """Kill a node; its tokens vanish at once."""
         self._vanish(name, KILL_SEEN_S)
 
-    def stop(self, name: str) -> None:
+    def stop(self, name: str, grace_s: float = 0.0) -> None:
         """Ask a node to stop, as SIGTERM does; a paused node stops when it is resumed."""
         member = self._members.get(name)
         if member is not None:
-            member.handle(Stopping())
+            member.handle(Stopping(grace_s))
 
     def pause(self, name: str) -> None:
         """Pause a node, as SIGSTOP does; its tokens vanish when the lease expires."""

@@ -41,6 +41,8 @@ SWITCH_S = 1e-4
 """Maximum time [s] for which Zenoh's thread waits for the interpreter lock; Python's own is 5 ms.
 
 With the default, a flood of messages that are refused lets hardly any others in."""
+ONE_SIGNAL_S = 0.2
+"""Time in which stop signals are one: `timeout` and shells send each of them twice."""
 
 
 def run_core(
@@ -48,8 +50,12 @@ def run_core(
     access: Access,
     pool: WorkerPool | None = None,
     observe: Observe = unobserved,
+    *,
+    grace_s: float = 0.0,
 ) -> None:
     """Run a core over Zenoh until it ends or the process receives SIGINT or SIGTERM.
+
+    With a grace, the core ends itself after the first signal; after the second one it ends at once.
 
     Must be called in the main thread. `Compute` jobs run in a thread, `Delegate` jobs in `pool`,
     which only a core that delegates needs. `observe` registers the metrics of the node and core.
@@ -73,7 +79,7 @@ def run_core(
         else:
             pool.stop(job.job)
 
-    with stop_signals(lambda: inbox.put(Stopping())):
+    with stop_signals(_StopSignals(inbox.put, grace_s)):
         # Until the process is connected, the inbox can contain only `Stopping`.
         transport = connect(access, inbox.put, lambda wait_s: any(inbox.take(wait_s)))
         if transport is None:
@@ -103,9 +109,9 @@ def _step(node: Node, inbox: Inbox) -> None:
 def _handle(node: Node, item: Item) -> None:
     now_s = time.monotonic()
     if isinstance(item, Stopping):
-        log.info("stopping")
+        log.info("stopping", grace_s=item.grace_s)
         node.dispatch(item, now_s)
-        node.ended = True
+        node.ended = node.ended or not item.grace_s
     elif isinstance(item, SnapshotRequest):
         item.answer(node.metrics())
     elif isinstance(item, Computed):
@@ -113,6 +119,23 @@ def _handle(node: Node, item: Item) -> None:
     else:
         node.deliver(item, now_s)
     node.handling_s += time.monotonic() - now_s
+
+
+class _StopSignals:
+    """Handler of stop signals: the first one grants the grace, the next one does not."""
+
+    def __init__(self, put: Callable[[Stopping], None], grace_s: float) -> None:
+        self._put = put
+        self._grace_s = grace_s
+        self._first_s: float | None = None
+
+    def __call__(self) -> None:
+        now_s = time.monotonic()
+        if self._first_s is None:
+            self._first_s = now_s
+            self._put(Stopping(self._grace_s))
+        elif now_s >= self._first_s + ONE_SIGNAL_S:
+            self._put(Stopping())
 
 
 class _Worker:
