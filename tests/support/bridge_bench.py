@@ -30,12 +30,13 @@ from laneweave.protocol.runtime.node import (
     Wakeup,
 )
 from laneweave.protocol.runtime.settings_check import CheckedCore, Process
-from laneweave.protocol.scenario.common_settings import AGENT_GROUPS, CommonSettings
+from laneweave.protocol.scenario.common_settings import settings_of
 from laneweave.protocol.scenario.deployment_fields import Shard
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.transports.simulated.network import SimulatedNetwork
 from laneweave.protocol.transports.simulated.virtual_time import Conditions
 from laneweave.protocol.wire.codec import encode
+from laneweave.protocol.wire.common_settings import AGENT_GROUPS
 from laneweave.protocol.wire.identities import Identity
 from laneweave.protocol.wire.messages import (
     Command,
@@ -343,7 +344,7 @@ class Street:
         scenario = scenario or self.scenario
         core = CoordinatorCore(Name(name), incarnation, scenario)
         process = Process.of(Identity(Party.COORDINATOR, name), incarnation)
-        self._add(name, CheckedCore(core, process, CommonSettings.of(scenario), CENSUS))
+        self._add(name, CheckedCore(core, process, settings_of(scenario), CENSUS))
         return core
 
     def start_agents(self, *vehicles: str) -> Sleeper:
@@ -368,7 +369,7 @@ class Street:
         self, name: str, core: Core, identity: Identity, drives: str, scenario: Scenario
     ) -> None:
         process = Process.of(identity, self._new_incarnation(), drives)
-        settings = CommonSettings.of(scenario)
+        settings = settings_of(scenario)
         self._add(name, CheckedCore(core, process, settings, SENSE, AGENT_GROUPS))
 
     def _make_host(

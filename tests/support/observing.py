@@ -13,8 +13,8 @@ from laneweave.launch.observe.road_view import RoadView
 from laneweave.launch.observe.status import Status, status_of
 from laneweave.protocol.runtime.node import Arrived, PeerDown, PeerUp
 from laneweave.protocol.runtime.settings_check import Process
-from laneweave.protocol.scenario.common_settings import CommonSettings
 from laneweave.protocol.wire import topics
+from laneweave.protocol.wire.common_settings import CommonSettings
 from laneweave.protocol.wire.identities import Identity
 from laneweave.protocol.wire.messages import (
     Census,

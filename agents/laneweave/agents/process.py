@@ -12,12 +12,13 @@ from laneweave.protocol.lattice import displacements
 from laneweave.protocol.runtime.message_faults import CoreWrapper, unwrapped
 from laneweave.protocol.runtime.metrics import Observe, unobserved
 from laneweave.protocol.runtime.settings_check import CheckedCore, Process
-from laneweave.protocol.scenario.common_settings import AGENT_GROUPS, CommonSettings
+from laneweave.protocol.scenario.common_settings import settings_of
 from laneweave.protocol.scenario.deployment_fields import Shard
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.security.connection import Access
 from laneweave.protocol.transports.zenoh.runner import run_core
 from laneweave.protocol.vehicle.motion import cell_state
+from laneweave.protocol.wire.common_settings import AGENT_GROUPS
 from laneweave.protocol.wire.identities import Incarnations, parse_identity
 from laneweave.protocol.wire.messages import CurrentMotion, Name, Sense, VehicleRecord
 from laneweave.protocol.wire.topics import SENSE
@@ -77,6 +78,6 @@ def run_agents(
     )
     drives = "named" if shard is None else shard.name
     process = Process.of(parse_identity(access.identity), incarnation, drives)
-    settings = CommonSettings.of(scenario)
+    settings = settings_of(scenario)
     core = CheckedCore(host, process, settings, SENSE, AGENT_GROUPS)
     run_core(wrap(core), access, observe=observe)

@@ -26,7 +26,7 @@ from laneweave.protocol.runtime.metrics import (
 from laneweave.protocol.runtime.processes import accepted_stop_signals
 from laneweave.protocol.runtime.settings_check import CheckedCore, Process
 from laneweave.protocol.runtime.worker_pool import WorkerPool
-from laneweave.protocol.scenario.common_settings import CommonSettings
+from laneweave.protocol.scenario.common_settings import settings_of
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.security.access_control import access_of
 from laneweave.protocol.transports.zenoh.runner import run_core
@@ -88,7 +88,7 @@ def run_coordinator(
         plan=partial(plan, compiled_only=True),
     )
     process = Process.of(Identity(Party.COORDINATOR, name), incarnation)
-    checked = CheckedCore(core, process, CommonSettings.of(scenario), CENSUS)
+    checked = CheckedCore(core, process, settings_of(scenario), CENSUS)
     with contextlib.closing(WorkerPool(workers, _load_branching)) as pool:
         if fork_workers:
             pool.fork()  # before the compilation starts a thread

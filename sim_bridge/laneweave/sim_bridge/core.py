@@ -46,11 +46,11 @@ from laneweave.protocol.wire.topics import (
     REPORT,
     VEHICLE_ALIVE,
 )
+from laneweave.sim_bridge.deployment import Deployment
 from laneweave.sim_bridge.recording.record_interface import Record
 from laneweave.sim_bridge.road.caretakers import notify_left
 from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.road.demand_queue import NO_OUTSIDE_TRAFFIC, OutsideTraffic
-from laneweave.sim_bridge.road.deployment import Deployment
 from laneweave.sim_bridge.road.roadside import Roadside
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
 from laneweave.sim_bridge.simulated_road import SimulatedRoad

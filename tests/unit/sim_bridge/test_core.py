@@ -26,7 +26,7 @@ from laneweave.protocol.wire import topics
 from laneweave.protocol.wire.messages import Census, CurrentMotion, Name, RoadClock, Sense
 from laneweave.protocol.wire.process_messages import Report
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import pose_of
-from laneweave.sim_bridge.core import CATCH_UP_S, SHUT_DOWN_S, TickPhase
+from laneweave.sim_bridge.core import CATCH_UP_S, CENSUS_S, SHUT_DOWN_S, TickPhase
 from laneweave.sim_bridge.road.caretakers import LEFT_REPEATS
 from support.bridge_bench import (
     TWO,
@@ -305,9 +305,13 @@ def test_the_entrance_waits_for_agents(tmp_path: Path) -> None:
     desk.start(A)
     desk.drive(lambda: desk.core.phase is TickPhase.AGENTS)
     tick, opened_s = desk.core.tick, desk.now_s
-    assert desk.core.wakeup_s == opened_s + PATIENCE_S
+    # Meanwhile it publishes the census, so that a process which has just started learns of them.
+    assert desk.core.wakeup_s == opened_s + CENSUS_S
     desk.now_s += 0.9 * PATIENCE_S
-    assert desk.give(Wakeup()) == []
+    (sent,) = desk.give(Wakeup())
+    assert isinstance(sent, Send)
+    assert isinstance(sent.message, Census)
+    assert B in [each.vehicle for each in sent.message.announced]
     assert asked(desk.up(B)) == [A, B]
     assert desk.core.tick == tick
     assert read_events(tmp_path, "agent-missing") == []
@@ -327,9 +331,8 @@ def test_after_one_timeout_the_entrance_waits_only_briefly_until_an_agent_comes(
         if name == "v2":
             desk.now_s += 0.5 * LITTLE_PATIENCE_S
             desk.up("v2")
-        else:
+        while Name(name) not in desk.core.vehicles:
             desk.wake()
-        assert Name(name) in desk.core.vehicles
         waited.append(desk.now_s - opened_s)
         desk.drive(lambda: desk.core.phase is TickPhase.PACE)
     little_s = LITTLE_PATIENCE_S

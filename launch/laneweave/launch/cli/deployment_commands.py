@@ -185,8 +185,9 @@ def _compare(settings: Scenario, realm: str, role: Party | None) -> int:
 
     from laneweave.launch.observe.bridge_lookup import settings_of_bridge
     from laneweave.protocol.errors import CommandFailedError, raise_all
-    from laneweave.protocol.scenario.common_settings import AGENT_GROUPS, GROUPS, CommonSettings
+    from laneweave.protocol.scenario.common_settings import settings_of
     from laneweave.protocol.security.access_control import access_of
+    from laneweave.protocol.wire.common_settings import AGENT_GROUPS, GROUPS
 
     network = attrs.evolve(settings.network, realm=realm)
     access = access_of(attrs.evolve(settings, network=network), "observer.status")
@@ -194,7 +195,7 @@ def _compare(settings: Scenario, realm: str, role: Party | None) -> int:
     if bridge is None:
         raise CommandFailedError(f"no bridge found in realm {realm} at {access.endpoint}")
     groups = AGENT_GROUPS if role in (Party.VEHICLE, Party.FLEET) else tuple(GROUPS)
-    own = CommonSettings.of(settings)
+    own = settings_of(settings)
     raise_all(
         BadInputError(one.name, Described(one.own), f"{one.other}, as the bridge in realm {realm}")
         for one in own.differences(bridge.values, groups)

@@ -77,7 +77,7 @@ def status(
     elif found.healthy:
         typer.echo("healthy")
     if found.findings:
-        raise CommandFailedError("\n".join(f"not healthy: {finding}" for finding in found.findings))
+        raise CommandFailedError(f"not healthy: {'; '.join(map(str, found.findings))}")
 
 
 def _expected(

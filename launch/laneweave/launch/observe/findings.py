@@ -17,13 +17,13 @@ from attrs import define, field, frozen
 from laneweave.launch.observe.observed import AGENT, BRIDGE, COORDINATOR, FLEET, Expected, Observed
 from laneweave.launch.observe.process_view import label_of
 from laneweave.launch.observe.road_view import RoadView, claims_of
-from laneweave.protocol.scenario.common_settings import (
+from laneweave.protocol.wire.codec import VERSION
+from laneweave.protocol.wire.common_settings import (
     AGENT_GROUPS,
     GROUPS,
     CommonSettings,
     different_groups,
 )
-from laneweave.protocol.wire.codec import VERSION
 from laneweave.protocol.wire.messages import ClosedFormation
 from laneweave.protocol.wire.topics import Party
 

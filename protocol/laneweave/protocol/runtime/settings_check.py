@@ -34,7 +34,7 @@ from laneweave.protocol.runtime.node import (
     core_metrics,
 )
 from laneweave.protocol.runtime.transport import LinkDown, LinkUp
-from laneweave.protocol.scenario.common_settings import (
+from laneweave.protocol.wire.common_settings import (
     GROUPS,
     CommonSettings,
     different_groups,

@@ -12,15 +12,15 @@ from laneweave.launch.observe.observed import Expected
 from laneweave.launch.observe.process_view import OtherVersion
 from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.runtime.transport import LinkDown
-from laneweave.protocol.scenario.common_settings import CommonSettings
+from laneweave.protocol.scenario.common_settings import settings_of
 from laneweave.protocol.scenario.deployment_fields import Shard
 from laneweave.protocol.wire.identities import Identity
 from laneweave.protocol.wire.messages import Ballot, ClosedFormation, Name
 from laneweave.protocol.wire.topics import Party
 from support.observing import BRIDGE, ELECTION_S, WALL_S, Listener
 
-OWN = CommonSettings.of(parse_scenario({}))
-OTHER = CommonSettings.of(parse_scenario({"formation": {"gap_m": 20.0}}))
+OWN = settings_of(parse_scenario({}))
+OTHER = settings_of(parse_scenario({"formation": {"gap_m": 20.0}}))
 EXPECTED = Expected(
     bridge=True, coordinators=("c1", "c2"), fleets={"a": Shard(0, 2), "b": Shard(1, 2)}
 )

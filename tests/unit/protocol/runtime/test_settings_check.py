@@ -26,7 +26,8 @@ from laneweave.protocol.runtime.node import (
 )
 from laneweave.protocol.runtime.settings_check import WAIT_S, CheckedCore, Process, SettingsMetrics
 from laneweave.protocol.runtime.transport import LinkDown, LinkUp
-from laneweave.protocol.scenario.common_settings import AGENT_GROUPS, GROUPS, CommonSettings
+from laneweave.protocol.scenario.common_settings import settings_of
+from laneweave.protocol.wire.common_settings import AGENT_GROUPS, GROUPS
 from laneweave.protocol.wire.identities import Identity
 from laneweave.protocol.wire.messages import RoadClock
 from laneweave.protocol.wire.process_messages import ProcessSettings
@@ -39,8 +40,8 @@ from laneweave.protocol.wire.topics import (
     Party,
 )
 
-OWN = CommonSettings.of(parse_scenario({}))
-OTHER = CommonSettings.of(parse_scenario({"formation": {"gap_m": 20.0}}))
+OWN = settings_of(parse_scenario({}))
+OTHER = settings_of(parse_scenario({"formation": {"gap_m": 20.0}}))
 FITS, DIFFERS, UNKNOWN = 5, 7, 9
 """Incarnations of bridges; the last one is of the release before, and declares no settings."""
 SETTINGS_OF = {FITS: OWN, DIFFERS: OTHER}
@@ -137,7 +138,7 @@ def test_who_does_not_fit_is_hidden_and_says_what_differs() -> None:
 
 
 def test_only_the_groups_that_a_core_uses_must_agree() -> None:
-    other = CommonSettings.of(parse_scenario({"formation": {"max_vehicles": 8}}))
+    other = settings_of(parse_scenario({"formation": {"max_vehicles": 8}}))
     token = process_token(FITS) | {"digests": other.digests, "incarnation": "11"}
     for groups, fits in ((AGENT_GROUPS, True), (tuple(GROUPS), False)):
         inner = Inner()

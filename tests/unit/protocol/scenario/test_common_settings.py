@@ -10,12 +10,12 @@ import attrs
 import pytest
 
 from laneweave.protocol.config.scenario_files import load_scenario, parse_scenario, to_tables
-from laneweave.protocol.scenario.common_settings import (
+from laneweave.protocol.scenario.common_settings import settings_of
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.wire.common_settings import (
     GROUPS,
-    CommonSettings,
     different_groups,
 )
-from laneweave.protocol.scenario.fields import Scenario
 from support.tables import for_each
 
 ROOT = Path(__file__).parents[4]
@@ -84,7 +84,7 @@ def test_every_field_of_a_scenario_is_common_or_has_a_reason_not_to_be() -> None
 
 @for_each("setting, tables", PAIRS)
 def test_a_difference_is_found_and_named(setting: str, tables: dict[str, Any]) -> None:
-    one, other = (CommonSettings.of(parse_scenario(each)) for each in ({}, tables))
+    one, other = (settings_of(parse_scenario(each)) for each in ({}, tables))
     assert setting in [each.name for each in one.differences(other.values)]
     group = next(group for group, names in GROUPS.items() if _is_in(setting, names))
     assert group in different_groups(one.digests, other.digests)
@@ -98,19 +98,19 @@ def _is_in(setting: str, names: tuple[str, ...]) -> bool:
 
 
 def test_what_is_written_otherwise_but_means_the_same_does_not_differ() -> None:
-    plain = CommonSettings.of(parse_scenario({}))
+    plain = settings_of(parse_scenario({}))
     for tables in (
         {"road": {"lanes": 3, "s1_m": 50}},
         {"demand": {"volume_veh_per_lane_h": 1500.0}, "seed": 9},
         {"formation": {"block_columns": 5}},  # without effect, as formations close by vehicles
         to_tables(parse_scenario({})),
     ):
-        assert CommonSettings.of(parse_scenario(tables)).digests == plain.digests
+        assert settings_of(parse_scenario(tables)).digests == plain.digests
 
 
 def test_demand_counts_where_the_slots_follow_from_it() -> None:
     quiet, dense = (
-        CommonSettings.of(
+        settings_of(
             parse_scenario(
                 {
                     "formation": {"operation": "rolling"},
@@ -127,4 +127,4 @@ def test_demand_counts_where_the_slots_follow_from_it() -> None:
 def test_scenarios_have_the_digests_of_the_release_before(scenario: str) -> None:
     """Otherwise an upgrade stops the road, process by process: see `common_settings`."""
     path = ROOT / "scenarios" / f"{scenario}.toml"
-    assert CommonSettings.of(load_scenario(path)).digests == DIGESTS[scenario]
+    assert settings_of(load_scenario(path)).digests == DIGESTS[scenario]

@@ -25,14 +25,14 @@ from laneweave.protocol.runtime.node import (
 )
 from laneweave.protocol.runtime.settings_check import PERIOD_S, Process
 from laneweave.protocol.runtime.transport import LinkUp
-from laneweave.protocol.scenario.common_settings import (
-    AGENT_GROUPS,
-    GROUPS,
-    CommonSettings,
-    different_groups,
-)
+from laneweave.protocol.scenario.common_settings import settings_of
 from laneweave.protocol.scenario.deployment_fields import Shard, parse_shard
 from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.wire.common_settings import (
+    AGENT_GROUPS,
+    GROUPS,
+    different_groups,
+)
 from laneweave.protocol.wire.events import SETTINGS_REFUSED
 from laneweave.protocol.wire.identities import Identity
 from laneweave.protocol.wire.messages import Name
@@ -62,7 +62,7 @@ class Deployment:
     def __init__(self, scenario: Scenario, incarnation: int, record: Record) -> None:
         """Begin without processes; `incarnation` is that of the bridge."""
         self._process = Process.of(Identity(Party.BRIDGE), incarnation)
-        self._settings = CommonSettings.of(scenario)
+        self._settings = settings_of(scenario)
         self._record = record
         self._start_s = scenario.runtime.agent_start_s
         self._short_s = scenario.network.resend_s
