@@ -45,6 +45,7 @@ from laneweave.coordinator.rolling.transfer import TRANSFER_RULES
 from laneweave.coordinator.service.server import ServiceMetrics
 from laneweave.launch.drawing.tappa_process import draw_explanation
 from laneweave.launch.fault_search.profiles import PROFILES
+from laneweave.launch.observe.findings import FindingsMetrics
 from laneweave.launch.observe.metrics_server import PROCESS, PROCESS_MEANING
 from laneweave.launch.recordings.results_over_seeds import RESULTS
 from laneweave.protocol.runtime.metrics import (
@@ -53,6 +54,7 @@ from laneweave.protocol.runtime.metrics import (
     RouterMetrics,
     metrics_of,
 )
+from laneweave.protocol.runtime.settings_check import SettingsMetrics
 from laneweave.protocol.security.access_control import READING, SENDING, Flow, rights_on
 from laneweave.protocol.state_machine import Function, RuleBook
 from laneweave.protocol.summary import described
@@ -112,6 +114,8 @@ SNAPSHOTS: dict[type[MetricsSnapshot], str] = {
     AgentMetrics: "agent",
     BridgeMetrics: "bridge",
     RouterMetrics: "router",
+    SettingsMetrics: "coordinator, agent",
+    FindingsMetrics: "watch, at its own address",
 }
 """Classes of metrics, each with the role that serves them."""
 

@@ -8,7 +8,7 @@ from typing import Any
 from attrs import define, field
 
 from laneweave.launch.observe.findings import Finding, Findings
-from laneweave.launch.observe.observed import Expected
+from laneweave.launch.observe.observed import NOTHING, Expected
 from laneweave.launch.observe.road_view import RoadView
 from laneweave.launch.observe.status import Status, status_of
 from laneweave.protocol.runtime.node import Arrived, PeerDown, PeerUp
@@ -33,9 +33,6 @@ WALL_S = 1.8e9
 BRIDGE = int(WALL_S * 1e9)
 """Incarnation of the bridge: its start time."""
 ELECTION_S = 0.7
-
-
-NOTHING = Expected()
 
 
 @define

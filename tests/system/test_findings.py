@@ -89,9 +89,8 @@ def deployment(lab: Lab) -> Iterator[Deployment]:
     found = Deployment(lab, lab.path("deployment.toml", text))
     router = start_router(lab, found.config)
     yield found
-    for name in ("bridge", "a", "b", "c1", "c2"):
-        if name in found.running:
-            found.running[name].send_signal(signal.SIGTERM)
+    for process in found.running.values():
+        process.send_signal(signal.SIGTERM)
     for process in found.running.values():
         assert lab.finish(process, END_S).status == 0
     stop(lab, router)
@@ -118,6 +117,47 @@ def test_what_is_missing_is_found_and_forgotten_when_it_is_back(deployment: Depl
         }, name
         deployment.start(name)
         deployment.wait_for_health()
+
+
+@pytest.mark.more
+def test_a_second_bridge_does_not_start_while_the_first_one_drives(deployment: Deployment) -> None:
+    lab, config = deployment.lab, deployment.config
+    for name in ROLES:
+        deployment.start(name)
+    deployment.wait_for_health()
+    second = lab.finish(lab.start("bridge", "--config", config, "--out", "second"), END_S)
+    assert second.status == 1
+    (line,) = second.complaints
+    assert line.startswith("another bridge drives a road in realm findings, since ")
+    assert line.endswith(": stop it, or start this one with --takeover")
+    assert not (lab.folder / "second").exists()
+    assert not deployment.findings()
+
+    # Whoever means it gets the road, and all are told.
+    taken = lab.start("bridge", "--config", config, "--takeover", "--out", "taken")
+    deployment.running["second"] = taken
+    deployment.wait_for(partial(blames, "bridge"))
+    assert ("several-bridges", "bridge") in deployment.findings()
+
+
+@pytest.mark.more
+def test_a_file_is_compared_with_a_bridge_before_a_role_starts(deployment: Deployment) -> None:
+    lab, config = deployment.lab, deployment.config
+    check = ("config", "check", config, "--against", "findings")
+    nobody = lab.run_forked(*check, alone=False)
+    assert nobody.status == 1
+    assert nobody.complaints[0].startswith("no bridge found in realm findings at ")
+    deployment.start("bridge")
+    deployment.wait_for(lambda found: ("no-bridge", "bridge") not in found)
+    fits = lab.run_forked(*check, alone=False)
+    assert (fits.status, fits.complaints) == (0, [])
+    assert "settings are those of the bridge in realm findings" in " ".join(fits.out.split())
+    text = config.read_text("utf-8") + "\n[formation]\ngap_m = 20.0\n"
+    other = lab.path("other.toml", text)
+    ended = lab.run_forked("config", "check", other, "--against", "findings", alone=False)
+    assert ended.status == 2
+    allowed = "15.0, as the bridge in realm findings"
+    assert f"formation.gap_m: got 20.0; allowed: {allowed}" in ended.complaints
 
 
 @pytest.mark.more

@@ -13,6 +13,7 @@ from typing import Annotated
 
 import structlog
 import typer
+from attrs import evolve
 from rich.console import Console
 
 from laneweave.launch.cli.options import (
@@ -200,11 +201,15 @@ def watch(
     ] = None,
 ) -> None:
     """Serve a page that shows the road of a deployment or of a recorded run, until Ctrl-C."""
+    from laneweave.launch.observe.observed import Expected
     from laneweave.launch.watch.process import watch_live, watch_recorded
 
     if folder is None:
         settings = load_deployment(config, endpoint, network__connect_timeout_s=wait)
-        watch_live(settings, listen, typer.echo)
+        expected = Expected.of(settings, bridge=True)
+        if config is None:
+            expected = evolve(expected, coordinators=())  # a default names none
+        watch_live(settings, listen, typer.echo, expected)
         return
     unused = {"config": config, "endpoint": endpoint, "wait": wait}
     reject_unused_options("with DIR, which needs no network", **unused)

@@ -9,14 +9,15 @@ it has lasted for the rule's `lasts_s`.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
-from typing import Final
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import ClassVar, Final
 
 from attrs import define, field, frozen
 
 from laneweave.launch.observe.observed import AGENT, BRIDGE, COORDINATOR, FLEET, Expected, Observed
 from laneweave.launch.observe.process_view import label_of
 from laneweave.launch.observe.road_view import RoadView, claims_of
+from laneweave.protocol.runtime.metrics import metric
 from laneweave.protocol.wire.codec import VERSION
 from laneweave.protocol.wire.common_settings import (
     AGENT_GROUPS,
@@ -359,6 +360,21 @@ RULES: Final = (
     ),
 )
 """All rules, the most telling ones first: a missing bridge explains what others find."""
+
+
+@frozen
+class FindingsMetrics:
+    """What an observer finds."""
+
+    ABOUT: ClassVar[str] = "observer"
+
+    findings: Mapping[str, int] = metric("Findings about the deployment", label="rule")
+
+    @classmethod
+    def of(cls, findings: Iterable[Finding]) -> FindingsMetrics:
+        """Return the number of findings of each rule."""
+        counts = Counter(one.rule for one in findings)
+        return cls({rule.name: counts[rule.name] for rule in RULES})
 
 
 @define

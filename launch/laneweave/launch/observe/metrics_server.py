@@ -11,7 +11,12 @@ from collections.abc import Iterator
 from http.server import ThreadingHTTPServer
 
 import structlog
-from prometheus_client import CollectorRegistry, MetricsHandler, ProcessCollector
+from prometheus_client import (
+    CollectorRegistry,
+    MetricsHandler,
+    ProcessCollector,
+    generate_latest,
+)
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
@@ -59,6 +64,18 @@ def families(snapshot: MetricsSnapshot) -> Iterator[Metric]:
         for labels, value in metric.samples(snapshot):
             family.add_metric(labels, value)
         yield family
+
+
+def text_of(snapshot: MetricsSnapshot) -> bytes:
+    """Return a snapshot in the Prometheus text format."""
+
+    class Snapshot(Collector):
+        def collect(self) -> Iterator[Metric]:
+            return families(snapshot)
+
+    registry = CollectorRegistry()
+    registry.register(Snapshot())
+    return generate_latest(registry)
 
 
 class _Server(ThreadingHTTPServer):

@@ -43,6 +43,10 @@ class Expected:
         return cls(bridge, coordinator_names(scenario), fleets)
 
 
+NOTHING = Expected()
+"""Nothing is expected."""
+
+
 @frozen
 class Observed:
     """What an observer knows at one moment."""

@@ -12,6 +12,8 @@ from collections.abc import Iterator
 from typing import Any
 
 from laneweave.launch.formation_columns import Formations
+from laneweave.launch.observe.findings import Finding, Findings
+from laneweave.launch.observe.observed import NOTHING, Expected
 from laneweave.launch.observe.road_view import RoadView, claims_of
 from laneweave.launch.watch.frames import (
     MOVING,
@@ -28,9 +30,18 @@ from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.lane_ends import LaneEnds
 from laneweave.protocol.wire.messages import CAR, Ballot, CensusEntry, Name, Plan, VehicleState
 from laneweave.protocol.wire.process_messages import LogEvent
-from laneweave.protocol.wire.topics import CENSUS, CLOCK, EVENT, HEARTBEAT, PLAN, STATE
+from laneweave.protocol.wire.topics import (
+    CENSUS,
+    CLOCK,
+    EVENT,
+    HEARTBEAT,
+    PLAN,
+    ROAD_STATUS,
+    SETTINGS,
+    STATE,
+)
 
-TOPICS = (STATE, CLOCK, CENSUS, HEARTBEAT, PLAN, EVENT)
+TOPICS = (STATE, CLOCK, CENSUS, HEARTBEAT, PLAN, EVENT, ROAD_STATUS, SETTINGS)
 """Subscribed topics, most frequent first."""
 UNHEARD_S = 1.0
 """Age (road time) of the newest state above which a vehicle counts as not heard from."""
@@ -43,9 +54,18 @@ MAX_COORDINATORS = 32
 class LiveRoad:
     """Observed state of a deployment."""
 
-    def __init__(self, scenario: Scenario, wall_s: float) -> None:
-        """Start at a wall-clock time, connected to the router."""
+    def __init__(self, scenario: Scenario, wall_s: float, expected: Expected = NOTHING) -> None:
+        """Start at a wall-clock time, connected to the router.
+
+        Args:
+            scenario: road and network.
+            wall_s: wall-clock time [s since 1970].
+            expected: processes that should be there.
+        """
         self.scenario = scenario
+        self._watchdog = Findings(expected, wall_s, scenario.network.election_s)
+        self.findings: list[Finding] = []
+        """What is wrong, the gravest first, as of the newest frame."""
         self._lane_ends = LaneEnds(scenario)
         self.view = RoadView()
         self._targets: dict[Ballot, dict[Name, Cell]] = {}
@@ -88,6 +108,7 @@ class LiveRoad:
         self._shown = self._identity(wall_s)
         self._update_status(wall_s)
         view = self.view
+        self.findings = self._watchdog.look(view, wall_s, wall_s)
         self._forget_departed()
         clock, formations = view.clock, self._formations()
         rows = self._rows(clock.t_s, formations) if clock is not None else ()
@@ -98,6 +119,7 @@ class LiveRoad:
             "w": round(wall_s, 3),
             "status": self._status,
             "since": round(self._since_s, 3),
+            "findings": [[one.process, one.what, one.advice] for one in self.findings],
             **self._leadership(wall_s),
             "counts": [clock.demanded, clock.entered, clock.on_road, clock.left] if clock else None,
             "plan": self._plan,

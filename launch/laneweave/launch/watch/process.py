@@ -17,14 +17,19 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, Final
 
+import attrs
 import structlog
 import uvicorn
 
+from laneweave.launch.observe.findings import FindingsMetrics
+from laneweave.launch.observe.metrics_server import text_of
+from laneweave.launch.observe.observed import Expected
 from laneweave.launch.observe.observer import Observer
+from laneweave.launch.observe.status import TOKENS
 from laneweave.launch.watch.frames import FrameBuffer, FrameSource, compact, ending, scene_of
 from laneweave.launch.watch.listening import address_of, open_socket
 from laneweave.launch.watch.live_road import TOPICS, LiveRoad
-from laneweave.launch.watch.server import Browsers, Health, make_app
+from laneweave.launch.watch.server import Browsers, Health, Metrics, make_app, no_metrics
 from laneweave.protocol.runtime.node import Arrived
 from laneweave.protocol.runtime.processes import accepted_stop_signals
 from laneweave.protocol.runtime.transport import Delivery
@@ -52,14 +57,29 @@ END_S: Final = 1.0
 """Grace period for browsers to disconnect at shutdown."""
 
 
-def watch_live(scenario: Scenario, listen: str, ready: Callable[[str], None]) -> None:
+def watch_live(
+    scenario: Scenario, listen: str, ready: Callable[[str], None], expected: Expected
+) -> None:
     """Serve the page of a deployment until SIGINT or SIGTERM; call `ready` with the page's URL.
+
+    `expected`: processes that should be there.
 
     Raises:
         BadInputError: there is no router at the endpoint, or the address cannot be used.
     """
-    with contextlib.closing(open_socket(listen)) as listener, _LiveObserver(scenario) as observer:
-        _serve(listener, observer.buffer, observer.browsers, observer.health, ready, observer.start)
+    with (
+        contextlib.closing(open_socket(listen)) as listener,
+        _LiveObserver(scenario, expected) as observer,
+    ):
+        _serve(
+            listener,
+            observer.buffer,
+            observer.browsers,
+            observer.health,
+            ready,
+            observer.start,
+            metrics=observer.metrics,
+        )
         observer.check()
 
 
@@ -78,7 +98,10 @@ def watch_run(
     Raises:
         BadInputError: there is no router at the endpoint.
     """
-    with contextlib.closing(listener), _LiveObserver(scenario, title) as observer:
+    with (
+        contextlib.closing(listener),
+        _LiveObserver(scenario, Expected.of(scenario, bridge=True), title) as observer,
+    ):
         _serve(
             listener,
             observer.buffer,
@@ -111,7 +134,7 @@ def watch_recorded(folder: Path, listen: str, ready: Callable[[str], None]) -> N
 class _LiveObserver:
     """Observer of a deployment that makes frames in a separate thread."""
 
-    def __init__(self, scenario: Scenario, title: str = "") -> None:
+    def __init__(self, scenario: Scenario, expected: Expected, title: str = "") -> None:
         """Connect to the router, with retries; the default title of the page is the realm.
 
         Raises:
@@ -120,11 +143,11 @@ class _LiveObserver:
         self.browsers = Browsers()
         title = title or scenario.network.realm
         self.buffer = FrameBuffer(scene_of(scenario, "live", title, STEP_S))
-        self._observer = Observer(Keys(scenario.network.realm), topics=TOPICS)
+        self._observer = Observer(Keys(scenario.network.realm), topics=TOPICS, tokens=TOKENS)
         self._transport = connect_blocking(access_of(scenario, IDENTITY), self._deliver)
         # Offset for wall-clock times that do not jump when the system clock is set.
         self._offset_s = time.time() - time.monotonic()
-        self._road = LiveRoad(scenario, self._wall_s())
+        self._road = LiveRoad(scenario, self._wall_s(), expected)
         self._made_s = self._wall_s()
         self._number = 0  # of the next frame
         self._stop = threading.Event()
@@ -156,11 +179,20 @@ class _LiveObserver:
             raise self._failure
 
     def health(self) -> tuple[bool, dict[str, Any]]:
-        """Return whether the observer is connected and makes frames."""
+        """Return whether nothing is wrong with the deployment, and this observer makes frames."""
         age_s = self._wall_s() - self._made_s
-        view = self._road.view
-        facts = {"connected": view.linked, "runs": view.roads, "frame_age_s": round(age_s, 3)}
-        return view.linked and age_s < 3.0 * IDLE_S, facts
+        view, findings = self._road.view, self._road.findings
+        facts = {
+            "connected": view.linked,
+            "runs": view.roads,
+            "frame_age_s": round(age_s, 3),
+            "findings": [attrs.asdict(one) for one in findings],
+        }
+        return not findings and age_s < 3.0 * IDLE_S, facts
+
+    def metrics(self) -> bytes:
+        """Return metrics of the findings in the Prometheus text format."""
+        return text_of(FindingsMetrics.of(self._road.findings))
 
     def _wall_s(self) -> float:
         return time.monotonic() + self._offset_s
@@ -220,9 +252,10 @@ def _serve(
     ready: Callable[[str], None],
     start: Callable[[Callable[[], None]], None] = lambda _: None,
     launcher: Connection | None = None,
+    metrics: Metrics = no_metrics,
 ) -> None:
     config = uvicorn.Config(
-        make_app(source, browsers, health),
+        make_app(source, browsers, health, metrics),
         log_config=None,
         # Do not log connects and disconnects of browsers on the terminal.
         log_level="critical",

@@ -1,4 +1,4 @@
-"""ASGI application with the page, its websocket, and the health check.
+"""ASGI application with the page, its websocket, the health check and metrics.
 
 Slow browsers get fewer frames: only the newest frame and the newest request of each browser are
 kept.
@@ -31,6 +31,7 @@ MAX_REQUEST_CHARACTERS: Final = 200
 """Maximum length of messages from the page."""
 POLICY_VIOLATION, TRY_LATER = 1008, 1013
 """Websocket status codes."""
+METRICS_TYPE: Final = "text/plain; version=0.0.4"
 HEADERS: Final = {
     "cache-control": "no-cache",
     "content-security-policy": (
@@ -113,7 +114,18 @@ Health = Callable[[], tuple[bool, dict[str, Any]]]
 """Returns whether the server is healthy, and details."""
 
 
-def make_app(source: FrameSource, browsers: Browsers, health: Health) -> Starlette:
+Metrics = Callable[[], bytes]
+"""Returns metrics in the Prometheus text format."""
+
+
+def no_metrics() -> bytes:
+    """Return no metrics."""
+    return b""
+
+
+def make_app(
+    source: FrameSource, browsers: Browsers, health: Health, metrics: Metrics = no_metrics
+) -> Starlette:
     """Return the application; `browsers` will contain the connected browsers."""
     scene = partial(opening, source, uuid4().hex)
 
@@ -121,6 +133,9 @@ def make_app(source: FrameSource, browsers: Browsers, health: Health) -> Starlet
         healthy, facts = health()
         facts = {"ok": healthy, **facts, "browsers": len(browsers.connected)}
         return JSONResponse(facts, status_code=200 if healthy else 503, headers=HEADERS)
+
+    async def show_metrics(_request: Request) -> Response:
+        return Response(metrics(), media_type=METRICS_TYPE, headers=HEADERS)
 
     async def stream(socket: WebSocket) -> None:
         if not same_origin(socket):
@@ -137,6 +152,7 @@ def make_app(source: FrameSource, browsers: Browsers, health: Health) -> Starlet
             Route("/road.js", _answer(road_script(), "text/javascript")),
             Route("/closed_parts.js", _answer(closed_parts_script(), "text/javascript")),
             Route("/healthz", healthz),
+            Route("/metrics", show_metrics),
             WebSocketRoute("/stream", stream),
         ]
     )

@@ -9,15 +9,18 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
+from laneweave.launch.observe.observed import Expected
 from laneweave.launch.watch.frames import UNATTENDED, UNHEARD, compact
 from laneweave.launch.watch.live_road import STILL_S, LiveRoad
 from laneweave.protocol.config.scenario_files import parse_scenario
+from laneweave.protocol.runtime.node import PeerUp
 from laneweave.protocol.runtime.transport import LinkDown, LinkUp
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.lane_ends import dead_ends
 from laneweave.protocol.wire.codec import decode, encode
-from laneweave.protocol.wire.messages import ClosedFormation, Heartbeat, Name
-from laneweave.protocol.wire.process_messages import LogEvent
+from laneweave.protocol.wire.messages import ClosedFormation, Heartbeat, Name, RoadClock
+from laneweave.protocol.wire.process_messages import LogEvent, RoadStatus
+from laneweave.protocol.wire.topics import BRIDGE_ALIVE
 from support.closed_lanes import DROP
 from support.convoy import BALLOT, ROLLING, Convoy
 from support.states import changed
@@ -306,3 +309,18 @@ def test_a_frame_of_90_vehicles_is_small() -> None:
         for send in convoy.messages(tick):
             road.update(send.message, 1.0)
     assert len(compact(road.frame(0, 1.0))) < 9000
+
+
+def test_what_is_wrong_is_in_the_frame() -> None:
+    road = LiveRoad(ROLLING, wall_s=100.0, expected=Expected(bridge=True))
+    assert road.frame(0, 100.0)["findings"] == []  # it may come at any moment
+    finding = ["bridge", "no bridge found", "start the bridge"]
+    assert finding in road.frame(1, 101.5)["findings"]
+    road.update(PeerUp(BRIDGE_ALIVE, {"incarnation": "5"}), 101.6)
+    road.update(RoadStatus(5, clock_s=101.6, unattended={Name("v1"): 12.0}), 101.6)
+    road.update(RoadClock(1, 0.1, 1, 1, 1, 0, ended=False, bridge=5), 101.6)
+    whats = [what for _, what, _ in road.frame(2, 102.0)["findings"]]
+    assert whats == [
+        "there is no leader: no coordinators found",
+        "1 vehicle has no agent, such as v1 for 12 s",
+    ]

@@ -18,9 +18,12 @@ from typing import Any
 import pytest
 import uvicorn
 from attrs import define, field
+from prometheus_client.parser import text_string_to_metric_families
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
+from laneweave.launch.observe.findings import RULES, Finding, FindingsMetrics
+from laneweave.launch.observe.metrics_server import text_of
 from laneweave.launch.watch.frames import MAX_REQUESTED, FrameBuffer, FrameSource, compact, ending
 from laneweave.launch.watch.listening import open_socket
 from laneweave.launch.watch.recorded_run import Recording
@@ -45,7 +48,9 @@ class Site:
 
     @contextlib.contextmanager
     def running(self) -> Iterator[Site]:
-        app = make_app(self.source, self.browsers, lambda: (self.healthy, {"more": 1}))
+        app = make_app(
+            self.source, self.browsers, lambda: (self.healthy, {"more": 1}), lambda: METRICS
+        )
         config = uvicorn.Config(app, log_config=None, lifespan="off", timeout_graceful_shutdown=1)
         server = uvicorn.Server(config)
         thread = threading.Thread(target=lambda: asyncio.run(self._serve(server)))
@@ -91,6 +96,9 @@ class Site:
         return browser
 
 
+METRICS = text_of(FindingsMetrics.of([Finding("no-bridge", "bridge", "gone", 1.0, "start it")]))
+
+
 def receive(browser: ClientConnection) -> dict[str, Any]:
     message: dict[str, Any] = json.loads(browser.recv(timeout=WAIT_S))
     return message
@@ -133,6 +141,14 @@ def test_the_health_check(site: Site) -> None:
     site.healthy = False
     status, _, text = site.get("/healthz")
     assert (status, json.loads(text)["ok"]) == (503, False)
+
+
+def test_metrics_of_the_findings(site: Site) -> None:
+    status, kind, text = site.get("/metrics")
+    assert (status, kind.partition(";")[0]) == (200, "text/plain")
+    (family,) = text_string_to_metric_families(text)
+    values = {sample.labels["rule"]: sample.value for sample in family.samples}
+    assert values == {rule.name: float(rule.name == "no-bridge") for rule in RULES}
 
 
 def test_a_browser_gets_the_scene_and_new_frames_and_those_that_it_requests(site: Site) -> None:

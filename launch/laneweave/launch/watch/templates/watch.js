@@ -385,6 +385,12 @@ class Watch {
         ended: `The run ended at ${since}${this.leftOf(frame)}. Waiting for the next one.`,
         live: "",
       }[pill];
+      const findings = frame.findings ?? [];
+      if (findings.length > 0 && pill !== "lost" && pill !== "ended") {
+        pill = "problem";
+        words = findings.map(([, what, advice]) => `${what}: ${advice}`).join("; ");
+        words = `${words[0].toUpperCase()}${words.slice(1)}.`;
+      }
     }
     const paused = this.live && this.place !== null && pill === "live";
     const shown = { waiting: "no road", lost: "connection lost", still: "clock stopped" }[pill];
