@@ -26,12 +26,13 @@ from laneweave.protocol.runtime.node import (
     Watch,
 )
 from laneweave.protocol.scenario.deployment_fields import Runtime, Shard
-from laneweave.protocol.wire.messages import Census, Motion, Name, VehicleState
+from laneweave.protocol.wire.messages import Census, Motion, Name, Sense, VehicleState
 from laneweave.protocol.wire.newest import NewestRoad
 from laneweave.protocol.wire.topics import (
     BRIDGE_ALIVE,
     CENSUS,
     MOTION,
+    SENSE,
     STATE,
     Topic,
     incarnation_of,
@@ -39,6 +40,9 @@ from laneweave.protocol.wire.topics import (
 
 NO_BRIDGE_S = 60.0
 """Time without a bridge after which a process for named vehicles exits (node clock)."""
+RETURN_S = 1.0
+"""Time after which the census, and until which a SENSE, shows that a vehicle has not left although
+its agent was told so (node clock)."""
 
 
 @frozen
@@ -87,6 +91,8 @@ class AgentHost:
         self._road = NewestRoad(runtime.max_pace)
         self._no_bridge_since_s: float | None = 0.0
         """Time at which the bridge was lost; None: a bridge is up."""
+        self._left: dict[Name, tuple[float, int]] = {}
+        """When agents were told that their vehicles have left (node clock), and in which tick."""
         self._solves = self._unusable = 0
         """Counters of agents that have been removed."""
 
@@ -106,8 +112,12 @@ class AgentHost:
 
     @property
     def wakeup_s(self) -> float | None:
-        """Time at which to stop waiting for a bridge; None: a bridge is up, or this is a shard."""
-        if self._shard is not None or self._no_bridge_since_s is None:
+        """Time at which a process for named vehicles exits, as far as known; None for a shard."""
+        if self._shard is not None:
+            return None
+        if not self._agents and self._left:
+            return max(at_s for at_s, _ in self._left.values()) + RETURN_S
+        if self._no_bridge_since_s is None:
             return None
         return self._no_bridge_since_s + NO_BRIDGE_S
 
@@ -119,7 +129,6 @@ class AgentHost:
                 if name != motion.vehicle and motion.stretch in agent.wanted_motions:
                     agent.on_motion(motion)
             return []
-        hosted = bool(self._agents)
         try:
             if isinstance(event, Arrived):
                 effects = self._on_message(event, now_s)
@@ -128,8 +137,6 @@ class AgentHost:
                 self._update_subscriptions(effects)
         except BadInputError as error:
             return [Refuse(error)]
-        if hosted and not self._agents and self._shard is None:
-            effects.append(End())  # last, since the node then disconnects
         return effects
 
     def _on_event(self, event: Event, now_s: float) -> list[Effect]:
@@ -170,8 +177,14 @@ class AgentHost:
             effects = self._on_census(message, now_s)
             self._update_subscriptions(effects)
             return effects
-        name = event.parameters.get("vehicle")
-        return self._dispatch(event, Name(name), now_s) if name in self._agents else []
+        name = Name(event.parameters.get("vehicle", ""))
+        if name in self._agents:
+            return self._dispatch(event, name, now_s)
+        if isinstance(message, Sense) and name in self._left and not message.left:
+            _, tick = self._left[name]
+            if message.tick > tick:
+                return [*self._start(name, now_s), *self._dispatch(event, name, now_s)]
+        return []
 
     def _dispatch_to_all(self, event: Event, now_s: float) -> list[Effect]:
         effects: list[Effect] = []
@@ -213,16 +226,26 @@ class AgentHost:
         self._unusable += stats.unusable
         return agent
 
-    def _dispatch(self, event: Event, name: Name, now_s: float) -> list[Effect]:
+    def _dispatch(self, event: Arrived, name: Name, now_s: float) -> list[Effect]:
         agent = self._agents[name]
         wanted = agent.wanted_motions, agent.wanted_states
         effects = agent.handle(event, now_s)
         if agent.ended:
             self._remove(name)
+            self._left[name] = now_s, event.message.tick
+            if self._shard is None:
+                # Until the process ends, a SENSE shows whether the message was true.
+                effects.append(Listen(SENSE, {"vehicle": name}))
         # Not after every message, since an update iterates over all agents.
         if agent.ended or wanted != (agent.wanted_motions, agent.wanted_states):
             self._update_subscriptions(effects)
         return effects
+
+    def _start(self, name: Name, now_s: float) -> list[Effect]:
+        """Start the agent of a vehicle, perhaps of one that had not left although it was told."""
+        self._left.pop(name, None)
+        self._agents[name] = self._make_agent(name)
+        return list(self._agents[name].handle(Started(), now_s))
 
     def _on_census(self, census: Census, now_s: float) -> list[Effect]:
         effects: list[Effect] = []
@@ -236,13 +259,14 @@ class AgentHost:
         listed = dict.fromkeys(entry.vehicle for entry in census.announced)
         listed |= dict.fromkeys(entry.vehicle for entry in census.on_road)
         for name in listed:
-            if name not in self._seen and shard.contains(name):
-                self._agents[name] = self._make_agent(name)
-                effects += self._agents[name].handle(Started(), now_s)
+            is_back = name in self._left and now_s >= self._left[name][0] + RETURN_S
+            if is_back or (name not in self._seen and shard.contains(name)):
+                effects += self._start(name, now_s)
         for name in sorted(set(self._agents) - set(listed)):
             # The vehicle has left, and the SENSE that reports it was lost.
             effects += self._remove(name).leave()
         self._seen = set(listed)
+        self._left = {name: told for name, told in self._left.items() if name in listed}
         return effects
 
     def _update_subscriptions(self, effects: list[Effect]) -> None:

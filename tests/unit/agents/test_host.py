@@ -10,7 +10,7 @@ from attrs import evolve
 from msgspec.structs import replace
 
 from laneweave.agents.core import AgentCore
-from laneweave.agents.host import NO_BRIDGE_S, AgentHost, AgentMetrics
+from laneweave.agents.host import NO_BRIDGE_S, RETURN_S, AgentHost, AgentMetrics
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.runtime import node
 from laneweave.protocol.scenario.deployment_fields import Shard
@@ -44,6 +44,12 @@ def make_host(*vehicles: Name, shard: Shard | None = None) -> AgentHost:
 
 def give(host: AgentHost, event: node.Event, now_s: float = 0.0) -> list[node.Effect]:
     return list(host.handle(event, now_s))
+
+
+def vehicles_of(host: AgentHost) -> int:
+    (metrics,) = host.metrics
+    assert isinstance(metrics, AgentMetrics)
+    return metrics.vehicles
 
 
 def hand(host: AgentHost, topic: topics.Topic, vehicle: Name, message: object) -> list[node.Effect]:
@@ -154,9 +160,41 @@ def test_ends_when_the_last_vehicle_has_left() -> None:
     host = make_host(A, B)
     for name in (A, B):
         feel(host, name)
-    assert node.End() not in feel(host, A, FRONT, 2, left=True)
-    assert feel(host, A, FRONT, 3) == []
-    assert feel(host, B, FRONT, 2, left=True).count(node.End()) == 1
+    feel(host, A, FRONT, 2, left=True)
+    assert host.wakeup_s != RETURN_S
+    feel(host, B, FRONT, 2, left=True)
+    # It may have been told in error.
+    assert host.wakeup_s == RETURN_S
+    assert give(host, node.Wakeup(), RETURN_S) == [node.End()]
+
+
+def test_an_agent_comes_back_that_was_told_in_error_that_its_vehicle_has_left() -> None:
+    host = make_host(A)
+    give(host, node.Started())
+    feel(host, A)
+    told = feel(host, A, FRONT, 2, left=True)
+    assert node.Withdraw(topics.VEHICLE_ALIVE, {"vehicle": A}) in told
+    listening = node.Listen(topics.SENSE, {"vehicle": A})
+    assert told.index(listening) > told.index(node.Unlisten(topics.SENSE, {"vehicle": A}))
+    assert feel(host, A, FRONT, 2) == feel(host, A, FRONT, 1) == []  # late
+    back = feel(host, A, FRONT, 3)
+    assert node.Announce(topics.VEHICLE_ALIVE, {"vehicle": A}) in back
+    assert topics.COMMAND in [getattr(effect, "topic", None) for effect in back]
+    assert vehicles_of(host) == 1
+    assert host.wakeup_s == NO_BRIDGE_S  # the process does not end
+
+
+def test_an_agent_of_a_shard_comes_back_if_the_census_lists_its_vehicle_for_long() -> None:
+    host = make_host(shard=Shard(0, 1))
+    give(host, census(on_road=[A]))
+    feel(host, A)
+    feel(host, A, FRONT, 2, left=True)
+    assert give(host, census(on_road=[A]), 0.9 * RETURN_S) == []
+    back = give(host, census(on_road=[A]), RETURN_S)
+    assert node.Announce(topics.VEHICLE_ALIVE, {"vehicle": A}) in back
+    feel(host, A, FRONT, 3, left=True)
+    assert give(host, census(), 1.0) == []
+    assert vehicles_of(host) == 0
 
 
 def test_what_agents_have_counted_stays_when_they_end() -> None:
@@ -174,13 +212,12 @@ def test_what_agents_have_counted_stays_when_they_end() -> None:
     assert after == evolve(driving, vehicles=1, vehicles_in_charge=1)
 
 
-def test_nothing_follows_the_end() -> None:
-    """Not even the end of a subscription: the node has left the network by then."""
+def test_an_agent_that_ends_waits_for_no_states() -> None:
     host = make_host(A)
     feel(host, A)
     accept(host, {A: FRONT, B: SIDE})  # A waits for B's state
     effects = feel(host, A, FRONT, 2, left=True)
-    assert effects[-2:] == [node.Unlisten(*STATES_OF_0), node.End()]
+    assert effects[-1] == node.Unlisten(*STATES_OF_0)
 
 
 @pytest.mark.parametrize("strangers", [[], ["ghost"]])
@@ -282,7 +319,7 @@ def test_a_shard_continues_without_vehicles_and_takes_none_twice() -> None:
     host = make_host(shard=Shard(0, 1))
     give(host, census(on_road=[A]))
     feel(host, A)
-    assert node.End() not in feel(host, A, FRONT, 2, left=True)
+    feel(host, A, FRONT, 2, left=True)
     assert give(host, census(on_road=[A])) == []
     assert give(host, node.Wakeup(), 1e6) == []
 
