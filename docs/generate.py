@@ -45,7 +45,7 @@ from laneweave.coordinator.rolling.transfer import TRANSFER_RULES
 from laneweave.coordinator.service.server import ServiceMetrics
 from laneweave.launch.drawing.tappa_process import draw_explanation
 from laneweave.launch.fault_search.profiles import PROFILES
-from laneweave.launch.observe.findings import FindingsMetrics
+from laneweave.launch.observe.findings import RULES, FindingsMetrics
 from laneweave.launch.observe.metrics_server import PROCESS, PROCESS_MEANING
 from laneweave.launch.recordings.results_over_seeds import RESULTS
 from laneweave.protocol.runtime.metrics import (
@@ -61,6 +61,7 @@ from laneweave.protocol.summary import described
 from laneweave.protocol.vehicle.execution_rules import VEHICLE_RULES
 from laneweave.protocol.vehicle.plan_execution import ExecutionPhase
 from laneweave.protocol.wire import events, messages, process_messages
+from laneweave.protocol.wire.common_settings import AGENT_GROUPS, GROUPS
 from laneweave.protocol.wire.identities import Identity
 from laneweave.protocol.wire.topics import TOPICS, Exchange, Party, Topic
 from laneweave.sim_bridge.core import BridgeMetrics
@@ -233,6 +234,26 @@ def _messages() -> str:
             lines += [f"| `{name}` | {text} |" for name, text in documented(node)]
             sections.append("\n".join(lines))
     return "\n\n".join(sections)
+
+
+def _settings() -> str:
+    """Return the rows of the table of settings that must agree."""
+    lines = ["| group | settings | compared by |", "|---|---|---|"]
+    lines += [
+        f"| {group} | {', '.join(f'`{name}`' for name in names)} "
+        f"| {'all roles' if group in AGENT_GROUPS else 'coordinators'} |"
+        for group, names in GROUPS.items()
+    ]
+    return "\n".join(lines)
+
+
+def _findings() -> str:
+    """Return the rows of the table of rules."""
+    lines = ["| rule | what is found | what to do |", "|---|---|---|"]
+    for one in RULES:
+        about = (one.find.__doc__ or "").partition("\n")[0].removesuffix(".")
+        lines.append(f"| `{one.name}` | {about} | {one.advice} |")
+    return "\n".join(lines)
 
 
 def _events() -> str:
@@ -824,6 +845,8 @@ def parts() -> dict[str, str]:
     return {
         "topics": _topics(),
         "messages": _messages(),
+        "settings": _settings(),
+        "findings": _findings(),
         "events": _events(),
         "api": api_reference(laneweave),
         "api of planners": api_reference(planners),

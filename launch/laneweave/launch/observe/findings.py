@@ -71,6 +71,7 @@ class Rule:
 
     name: str
     find: Callable[[Observed], Found]
+    """Its docstring describes the problem, also in docs/DEPLOYMENT.md."""
     advice: str
     lasts_s: float = 0.0
     """Time for which the condition must be observed."""
@@ -81,11 +82,13 @@ class Rule:
 
 
 def _link_lost(observed: Observed) -> Found:
+    """The connection to the router was lost."""
     if not observed.view.linked:
         yield ROUTER, "the connection to the router was lost"
 
 
 def _no_bridge(observed: Observed) -> Found:
+    """No bridge has its token: it never started, was killed, or has vanished."""
     view = observed.view
     if view.bridge_tokens or (not observed.expected.bridge and view.clock is None):
         return
@@ -99,6 +102,7 @@ def _no_bridge(observed: Observed) -> Found:
 
 
 def _bridge_silent(observed: Observed) -> Found:
+    """A bridge has its token, but hangs or was stopped."""
     for bridge in observed.view.bridge_tokens & {observed.view.bridge, *_only(observed)}:
         silent_s = observed.unheard_s(bridge)
         never = bridge not in observed.view.processes.bridges_heard_s
@@ -113,6 +117,7 @@ def _only(observed: Observed) -> Iterable[int]:
 
 
 def _several_bridges(observed: Observed) -> Found:
+    """Several bridges drive roads in one realm."""
     heard = [
         bridge
         for bridge in sorted(observed.view.bridge_tokens)
@@ -124,6 +129,7 @@ def _several_bridges(observed: Observed) -> Found:
 
 
 def _road_stands(observed: Observed) -> Found:
+    """The road waits for agents at the entrance for 2 s or more."""
     status, clock = observed.status, observed.view.clock
     if status is None or clock is None or status.standing_s < STANDING_S:
         return
@@ -136,6 +142,7 @@ def _road_stands(observed: Observed) -> Found:
 
 
 def _no_leader(observed: Observed) -> Found:
+    """No coordinator leads."""
     candidates = observed.candidates
     if claims_of(candidates):
         return
@@ -145,6 +152,7 @@ def _no_leader(observed: Observed) -> Found:
 
 
 def _several_leaders(observed: Observed) -> Found:
+    """Several coordinators lead for 3 s or more: they do not accept each other's messages."""
     claims = claims_of(observed.candidates)
     if len({one.coordinator for one in claims}) > 1:
         names = " and ".join(sorted(one.coordinator for one in claims))
@@ -153,6 +161,7 @@ def _several_leaders(observed: Observed) -> Found:
 
 
 def _same_name(observed: Observed) -> Found:
+    """Two live coordinators have the same name."""
     # The token of a killed process may persist, so only processes with heartbeats count.
     active = Counter(
         one.coordinator for one in observed.candidates if one.is_active(observed.election_s)
@@ -164,6 +173,7 @@ def _same_name(observed: Observed) -> Found:
 
 
 def _coordinator_missing(observed: Observed) -> Found:
+    """A candidate has no token."""
     there = {one.coordinator for one in observed.candidates}
     for name in observed.expected.coordinators:
         if name not in there:
@@ -171,6 +181,7 @@ def _coordinator_missing(observed: Observed) -> Found:
 
 
 def _coordinator_silent(observed: Observed) -> Found:
+    """A candidate has its token, but sends no heartbeats."""
     active = {one.coordinator for one in observed.candidates if one.is_active(observed.election_s)}
     for one in observed.candidates:
         if one.coordinator not in active:
@@ -181,10 +192,9 @@ def _coordinator_silent(observed: Observed) -> Found:
 
 
 def _nothing_planned(observed: Observed) -> Found:
-    """Find a leader that plans no formation although some have been closed for long.
+    """Formations have been closed for 20 s without a plan, and so have all behind them.
 
-    A single formation without a plan may have been closed too late to sort; those behind it have
-    plans then.
+    A single formation without a plan may have been closed too late to sort.
     """
     view = observed.view
     claims = claims_of(observed.candidates)
@@ -209,6 +219,7 @@ def _nothing_planned(observed: Observed) -> Found:
 
 
 def _fleet_missing(observed: Observed) -> Found:
+    """A shard has no process."""
     present = set(observed.shards_present().values())
     for name, shard in observed.fleets.items():
         # Fleets of the release before have no token of their own.
@@ -221,12 +232,14 @@ def _fleet_missing(observed: Observed) -> Found:
 
 
 def _agent_missing(observed: Observed) -> Found:
+    """The agent of a vehicle, asked for by name, is not there."""
     for vehicle in observed.expected.vehicles:
         if vehicle not in observed.view.agent_tokens:
             yield label_of(AGENT, vehicle), f"no agent of {vehicle} found"
 
 
 def _unattended(observed: Observed) -> Found:
+    """Vehicles on the road have had no agent for 2 s or more."""
     by_process: dict[str, dict[str, float]] = {}
     for vehicle, for_s in observed.unattended().items():
         if for_s >= UNATTENDED_S:
@@ -250,6 +263,7 @@ def _starter(observed: Observed, vehicle: str) -> str:
 
 
 def _other_settings(observed: Observed) -> Found:
+    """The settings of a process differ from those of the bridge."""
     processes = observed.view.processes
     newest = observed.view.bridge
     bridge = next((one for one in processes.tokens if one.incarnation == newest), None)
@@ -272,6 +286,7 @@ def _other_settings(observed: Observed) -> Found:
 
 
 def _clock_off(observed: Observed) -> Found:
+    """A clock is off by 12 h or more; with a day, processes refuse each other's messages."""
     status = observed.status
     if status is not None and abs(status.clock_s - observed.wall_s) > CLOCK_OFF_S:
         yield BRIDGE, f"the clock of the bridge is {_off(status.clock_s - observed.wall_s)}"
@@ -288,6 +303,7 @@ def _off(ahead_s: float) -> str:
 
 
 def _overlap(observed: Observed) -> Found:
+    """Bodies have overlapped."""
     status = observed.status
     if status is not None and status.overlaps:
         pairs = "pair" if status.overlaps == 1 else "pairs"
@@ -295,12 +311,14 @@ def _overlap(observed: Observed) -> Found:
 
 
 def _not_recorded(observed: Observed) -> Found:
+    """The disk of the bridge is full or fails."""
     status = observed.status
     if status is not None and not status.recording:
         yield BRIDGE, "the run is no longer recorded"
 
 
 def _other_version(observed: Observed) -> Found:
+    """A process sends messages of another version."""
     for sender, version in observed.view.processes.other_versions.items():
         yield sender, f"messages of {sender} have version {version!r:.40}, not {VERSION}"
 
