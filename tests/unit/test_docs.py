@@ -253,7 +253,7 @@ def _fields_of(kind: type, prefix: str = "") -> Iterator[str]:
     for attribute in attrs.fields(kind):
         parts = [hints[attribute.name], *get_args(hints[attribute.name])]
         inner = next((part for part in parts if isinstance(part, type) and attrs.has(part)), None)
-        if inner is None or attribute.name in ("candidates", "road"):
+        if inner is None or attribute.name in ("candidates", "findings", "road"):
             yield f"{prefix}{attribute.name}"
         if inner is not None:
             yield from _fields_of(inner, f"{prefix}{attribute.name}.")

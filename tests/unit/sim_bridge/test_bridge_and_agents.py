@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from laneweave.agents.host import RETURN_S
 from laneweave.coordinator.core import CoordinatorCore
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.transports.simulated.virtual_time import Conditions
@@ -285,7 +286,9 @@ def test_a_whole_run_counts_every_message_once_and_keeps_little_of_vehicles_that
     assert most == 1  # until its agent's token is gone, not for all the repeats
     assert street.network.now_s - ended_s[0] < 0.1  # the reports were there: no waiting
     if shards is None:
-        assert all(node.ended for node in street.nodes)  # each when its vehicle had left
+        # Each when its vehicle had left, and nothing has shown for a while that it had not.
+        street.network.run(street.network.now_s + 2.0 * RETURN_S)
+        assert all(node.ended for node in street.nodes)
     else:
         check_all_gone(street)
 

@@ -168,11 +168,13 @@ def bridge(
 
     check_pace(pace, "--pace")
     settings = load_deployment(config, endpoint, observation__metrics=metrics)
-    with _as_role("bridge", "bridge", settings, log_format, log_level) as observe:
+    with (
+        _as_role("bridge", "bridge", settings, log_format, log_level) as observe,
+        new_folder(out, settings, FORMATION) as folder,
+    ):
         if not takeover:
             refuse_second_bridge(access_of(settings, "bridge"))
-        with new_folder(out, settings, FORMATION) as folder:
-            run_bridge(settings, folder, FORMATION, pace, observe=observe)
+        run_bridge(settings, folder, FORMATION, pace, observe=observe)
     outcome = complete_summary(folder, problems=(), interrupted=stop_signal_received())
     print_outcome(outcome, Console())
     if outcome.has_traffic:

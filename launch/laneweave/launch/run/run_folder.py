@@ -13,7 +13,7 @@ from pathlib import Path
 
 from attrs import evolve
 
-from laneweave.protocol.errors import BadInputError, RefusedError
+from laneweave.protocol.errors import BadInputError, CommandFailedError, RefusedError
 from laneweave.protocol.files import write_atomically
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.summary import (
@@ -51,7 +51,7 @@ def new_folder(out: Path | None, settings: Scenario, method: str) -> Iterator[Pa
     existed, log = _claim(folder)
     try:
         yield folder
-    except (BadInputError, RefusedError, KeyboardInterrupt):
+    except (BadInputError, RefusedError, CommandFailedError, KeyboardInterrupt):
         files = list(folder.iterdir())
         if files == [folder / LOG_FILE]:
             files[0].unlink()

@@ -15,25 +15,23 @@ class ProcessSettings(Message, frozen=True):
 
     Also from any other process whose settings differ from those of the bridge, to the bridge and
     observers, as long as they differ. Missing: a process that may not act cannot say which of its
-    settings differ; whether they do, it knows from the bridge's token. Duplicated: no effect. From
-    an earlier bridge: ignored.
+    settings differ; whether they do, it knows from the bridge's token. Late or duplicated: no
+    effect, since settings never change. From an earlier bridge: ignored.
     """
 
     role: Name
     name: Name
     incarnation: Int64
     """Incarnation of the sender [ns]."""
-    values: dict[str, str] = field(default_factory=dict)
+    values: dict[str, str]
     """Value of each setting as JSON text, by its name in the scenario file."""
-    release: str = ""
-    """Release of the sender."""
 
 
 class RoadStatus(Message, frozen=True):
     """Bridge to observers, every second (wall clock): what keeps the road from driving as planned.
 
-    Missing for 3 s, although the bridge has its token: the bridge hangs. Duplicated: no effect.
-    From an earlier bridge: shows that there are two bridges.
+    Missing for 3 s, although the bridge has its token: the bridge hangs. Late: shown until the next
+    one. Duplicated: no effect. From an earlier bridge: shows that there are two bridges.
     """
 
     bridge: Int64

@@ -172,7 +172,7 @@ EVENT = Topic(
     remark="the bridge's recorder; so far only coordinators send events",
 )  # fmt: skip
 ROAD_STATUS = Topic(
-    "road-status", "road-status", process_messages.RoadStatus, Party.BRIDGE, Quality.LATEST,
+    "status", "status", process_messages.RoadStatus, Party.BRIDGE, Quality.LATEST,
     readers=(Party.BRIDGE, Party.OBSERVER), long=True,
     remark="the bridge: before it starts, those of another one",
 )  # fmt: skip

@@ -69,7 +69,7 @@ def may_read(who: str, key: str) -> bool:
 @for_each(
     ("key", "senders", "readers"),
     [
-        ("clock", "bridge", "c1 c2 watch"),
+        ("clock", "bridge", "bridge c1 c2 watch"),
         ("census", "bridge", "c1 c2 two watch"),
         ("sense/a", "bridge", "a two"),
         ("command/a", "a two", "bridge"),
@@ -146,7 +146,9 @@ def test_the_rights_of_a_fleet_are_those_of_its_vehicles_and_the_census() -> Non
         return {(rule.flow, rule.message, key) for rule in rules(who) for key in rule.keys}
 
     more = rights("fleet.two") - rights("vehicle.a") - rights("vehicle.b")
-    assert {key for _, _, key in more} == {PREFIX + "census"}
+    own_keys = ("alive/process/fleet/two/*/*/*", "settings/fleet/two", "report/fleet/two")
+    expected = ("census", *own_keys, "event/fleet/two")
+    assert {key for _, _, key in more} == {PREFIX + key for key in expected}
     assert rights("vehicle.a") | rights("vehicle.b") < rights("fleet.two")
     even, odd = rights("fleet.even"), rights("fleet.odd")
     own = {key for _, _, key in even & odd if "v0" in key}

@@ -260,9 +260,8 @@ def wrong_values(hint: Any) -> list[Any]:  # noqa: ANN401
         keys: list[Any] = [{1: 1}, {"a": {1: 1}}, {b"a": 1}]
         return [*NOT_MAPS, *keys, *({"a": item} for item in foreign)]
     if get_origin(hint) is dict:
-        named: list[Any] = [
-            {name: right_value(parts[1])} for name in (*NAMES_NOT_ALLOWED, 1, None, b"v1")
-        ]
+        names = (*(NAMES_NOT_ALLOWED if parts[0] is Name else ()), 1, None, b"v1")
+        named: list[Any] = [{name: right_value(parts[1])} for name in names]
         return [*NOT_MAPS, *named, *({"v1": wrong} for wrong in wrong_values(parts[1]))]
     if get_origin(hint) is tuple and parts[-1] is Ellipsis:
         return [*NOT_LISTS] + [[wrong] for wrong in wrong_values(parts[0])]

@@ -23,8 +23,8 @@ def filled(topic: topics.Topic, text: str = "x") -> dict[str, str]:
     return {name: f"{text}{index}" for index, name in enumerate(topic.parameters)}
 
 
-@given(st.sampled_from(topics.TOPICS), st.lists(NAMES, min_size=3, max_size=3), NAMES)
-@example(topics.STATE, ["y" * 64] * 3, "x" * 64)
+@given(st.sampled_from(topics.TOPICS), st.lists(NAMES, min_size=5, max_size=5), NAMES)
+@example(topics.STATE, ["y" * 64] * 5, "x" * 64)
 def test_what_is_built_is_read_back(topic: topics.Topic, texts: list[str], realm: str) -> None:
     keys = topics.Keys(realm)
     parameters = dict(zip(topic.parameters, texts, strict=False))
