@@ -18,6 +18,7 @@ from itertools import islice, product
 
 from attrs import evolve, field, frozen
 
+from laneweave.coordinator.formations.out_of_reach import OutOfReach, reasons_of
 from laneweave.coordinator.formations.roster import Numbers
 from laneweave.coordinator.formations.stages import Stage
 from laneweave.coordinator.planning.budget import Clock
@@ -68,6 +69,8 @@ class SortingTask:
     """Stage of the road; its closed lanes are not used. None: all lanes are open."""
     moves: Mapping[Name, frozenset[Cell]] = field(factory=dict)
     """Moves (columns, lanes) that members of some types can drive; others drive all."""
+    too_late: Collection[Name] = frozenset()
+    """Those of `unattended` that have agents, but are too late for the stage."""
 
     @property
     def columns(self) -> range:
@@ -151,6 +154,8 @@ class Sorting:
     could help."""
     impossible: str = ""
     """Why the structure has too few cells, in which case no member moves; empty: it has enough."""
+    reasons: Mapping[Name, OutOfReach] = field(factory=dict)
+    """Why each of `out_of_reach` does not reach its lane."""
 
     @property
     def solved(self) -> bool:
@@ -334,4 +339,4 @@ def _sorting(task: SortingTask, response: PlanResponse | None) -> Sorting:
     known = response is not None and response.status != "timeout"
     short = {*missed}.difference(task.unattended)
     short_of_room = known and bool(short) and not task.hindered.issuperset(short)
-    return Sorting(response, moves, missed, short_of_room)
+    return Sorting(response, moves, missed, short_of_room, reasons=reasons_of(task, missed))
