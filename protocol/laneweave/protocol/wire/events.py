@@ -170,7 +170,7 @@ MEANINGS: Final[Mapping[str, str]] = {
     "phase": "preparing: promises are missing; issuing: acceptances of the plan",
     "since_s": "road time since which the sender leads [s]",
     "unattended_since_s": "road time since which no agent was in charge [s]; null: one was",
-    "leader_until_s": "road time of the newest heartbeat of a leader before [s]; null: there was none",
+    "leader_until_s": "road time of the last heartbeat of a leader before [s]; null: none",
     "occupant": "vehicle, or gap for one, that occupies a cell on the way",
     "excess_m": "how far the command would have led the body out of its cells [m]",
     "previous": "who was in charge before: caretaker or agent",
