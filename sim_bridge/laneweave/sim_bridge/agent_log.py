@@ -28,8 +28,8 @@ class AgentLog:
     """Returns the fleet that drives a vehicle; empty: none is known."""
     _without: frozenset[Name] = frozenset()
     """Vehicles without agents at the last call."""
-    _waiting: dict[tuple[str, str], tuple[float, list[Name]]] = field(factory=dict)
-    """When each line is due, and its vehicles, by change and fleet."""
+    _waiting: dict[tuple[str, str], tuple[float, float, list[Name]]] = field(factory=dict)
+    """When each line was begun, when it is due, and its vehicles, by change and fleet."""
     _logged_s: dict[tuple[str, str], float] = field(factory=dict)
     """When each line was written last."""
 
@@ -57,11 +57,11 @@ class AgentLog:
         for vehicle in sorted(vehicles):
             key = change, self.fleet_of(vehicle)
             again_s = self._logged_s.get(key, -REPEAT_S) + REPEAT_S
-            due = self._waiting.setdefault(key, (max(t_s + GATHER_S, again_s), []))
-            due[1].append(vehicle)
+            line = self._waiting.setdefault(key, (t_s, max(t_s + GATHER_S, again_s), []))
+            line[2].append(vehicle)
 
     def _write(self, t_s: float, *, all_lines: bool = False) -> None:
-        for key, (due_s, vehicles) in list(self._waiting.items()):
+        for key, (begun_s, due_s, vehicles) in list(self._waiting.items()):
             if t_s < due_s and not all_lines:
                 continue
             del self._waiting[key]
@@ -73,7 +73,7 @@ class AgentLog:
                 fleet=fleet or "unknown",
                 count=len(vehicles),
                 vehicles=_names(vehicles),
-                road_s=round(t_s, 3),
+                road_s=round(begun_s, 3),
             )
 
 

@@ -117,7 +117,7 @@ FIELDS: Final[Mapping[str, tuple[str, ...]]] = {
     COMMAND_REFUSED: ("vehicle", "reason", "excess_m", "occupant"),
     SETTINGS_REFUSED: ("process", "incarnation", "settings"),
     OVERLAP: ("vehicles",),
-    RUN_ENDED: ("ending",),
+    RUN_ENDED: ("ending", "leader_until_s"),
 }
 """Data of each event, beside `COMMON_FIELDS`."""
 COMMON_FIELDS: Final = ("t_s", "kind", "role", "name")

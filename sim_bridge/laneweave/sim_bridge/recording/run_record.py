@@ -396,7 +396,8 @@ class RunRecord:
         """Write all files; only the first call has an effect."""
         if self._closed:
             return
-        self.event(t_s, RUN_ENDED, ending=ending.value)
+        until_s = self._leadership.until_s
+        self.event(t_s, RUN_ENDED, ending=ending.value, leader_until_s=until_s)
         self._closed = True
         with self._disk.writing(), ExitStack() as closing:
             for file in (self._events, self._trajectories, self._trips, self._ticks):
