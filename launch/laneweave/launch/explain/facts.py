@@ -42,6 +42,15 @@ _OF_FORMATION = frozenset(
 )
 _OF_SEVERAL = {kinds.OVERLAP: "vehicles", kinds.TRANSFER_ABORTED: "roster"}
 """Kinds of events about several vehicles, with the field that names them."""
+_RANKS = (
+    kinds.PLAN_MADE,
+    kinds.LANE_OUT_OF_REACH,
+    kinds.PLAN_IN_FORCE,
+    kinds.LEFT,
+    kinds.LEFT_OFF_LANE,
+    kinds.RUN_ENDED,
+)
+"""Order of events of the same time, after all others."""
 LEADER_LOST = "leader-lost"
 """Kind of an entry of `Facts.events` that stands for the last heartbeat of a leader."""
 
@@ -101,6 +110,8 @@ class Facts:
     """Times in which a caretaker was in charge of it."""
     without_agent: dict[str, Absence] = field(factory=dict)
     """Vehicles with caretakers in charge when the facts end."""
+    last_absences: dict[str, Absence] = field(factory=dict)
+    """The last time without an agent of every vehicle that has had one."""
     never_attended: bool = False
     """Whether its agent did not start in time."""
     refused: list[Event] = field(factory=list)
@@ -130,10 +141,6 @@ class Facts:
         ended = [gap for gap in self.leader_gaps if gap[1] <= t_s]
         return ended[-1] if ended else None
 
-    def absent(self, vehicle: str) -> Absence | None:
-        """Return since when a vehicle has had no agent when the facts end."""
-        return self.without_agent.get(vehicle)
-
 
 def facts_of(events: Iterable[Event], vehicle: str, leaderless_after_s: float) -> Facts:
     """Return the facts about a vehicle.
@@ -144,13 +151,22 @@ def facts_of(events: Iterable[Event], vehicle: str, leaderless_after_s: float) -
         leaderless_after_s: see `Facts`.
     """
     facts = Facts(vehicle, leaderless_after_s)
-    for event in sorted(events, key=lambda event: float(event["t_s"])):
+    for event in sorted(events, key=_order):
         # The event `left-off-lane` has the time of `left`.
         if facts.left is not None and float(event["t_s"]) > float(facts.left["t_s"]):
             break
         _add(facts, event)
     _add_end(facts)
     return facts
+
+
+def _order(event: Event) -> tuple[float, int]:
+    """Return the sort key of an event: time, and its place among those of the same time.
+
+    Messages of a coordinator may be recorded in another order than they were sent.
+    """
+    kind = event["kind"]
+    return float(event["t_s"]), _RANKS.index(kind) if kind in _RANKS else -1
 
 
 def _add(facts: Facts, event: Event) -> None:
@@ -207,7 +223,7 @@ def _add_charge(facts: Facts, event: Event) -> None:
     vehicle, t_s = str(event["vehicle"]), float(event["t_s"])
     if event["kind"] == kinds.CARETAKER_TOOK_OVER:
         absence = Absence(t_s, str(event["reason"]))
-        facts.without_agent[vehicle] = absence
+        facts.without_agent[vehicle] = facts.last_absences[vehicle] = absence
         if vehicle == facts.vehicle:
             facts.absences.append(absence)
     else:
@@ -288,7 +304,7 @@ def _add_end(facts: Facts) -> None:
         if until_s is None or facts.end_s > until_s + facts.leaderless_after_s:
             facts.leader_gaps.append((until_s or 0.0, math.inf))
     facts.events += _lost_leaders(facts)
-    facts.events.sort(key=lambda event: float(event["t_s"]))
+    facts.events.sort(key=_order)
 
 
 def _lost_leaders(facts: Facts) -> Iterator[Event]:

@@ -150,9 +150,13 @@ def _unreached(facts: Facts) -> Finding | None:
             return Finding(Reason.TOO_LATE, f"it was too late for its lane change in {planned}")
         case _:
             pass
-    # A plan of the rolling operation, or of an earlier version: the agents say more.
+    # A plan of the rolling operation, or of an earlier version: other facts say more.
     if facts.absence is not None:
         return _absence(facts.absence)
+    if facts.rolling and facts.leaderless_since_s is not None:
+        return _no_leader(facts.leaderless_since_s)
+    if facts.rolling and (facts.off_lane or {}).get("reason") == reasons.NO_PLAN:
+        return Finding(Reason.NO_ANSWER, "it has accepted none of the plans of the leader")
     if facts.without_agent:
         by = _with_absences(facts, facts.without_agent)
         text = f"{planned} did not reach its lane; without agents, and perhaps on its way: {by}"
@@ -281,7 +285,7 @@ def _with_absences(facts: Facts, vehicles: Iterable[str]) -> str:
     """Return the names of vehicles, each with the time since which it has no agent."""
     named = []
     for name in vehicles:
-        absence = facts.absent(name)
+        absence = facts.last_absences.get(name)
         named.append(
             name if absence is None else f"{name} (no agent since {seconds(absence.since_s)})"
         )
