@@ -185,9 +185,7 @@ def _too_late(facts: Facts) -> Finding | None:
         # The agent was lost while a plan was under way, and the next plan was too late.
         return _absence(absence)
     if reason == reasons.PLANNING_FAILED:
-        return Finding(
-            Reason.PLANNING_FAILED, f"planning failed until {seconds(event['t_s'])}, and then {at}"
-        )
+        return Finding(Reason.PLANNING_FAILED, f"{_planning_failed(facts)}, and {at}")
     others = [name for name in facts.without_agent if name in facts.members]
     if others:
         by = _with_absences(facts, others)
@@ -219,11 +217,16 @@ def _unplanned(facts: Facts) -> Finding:
         text = f"its formation had no plan: {waited} did not answer the leader"
         return Finding(Reason.NO_ANSWER, text)
     if facts.failed:
-        error = facts.failed[-1].get("error") or facts.failed[-1].get("status")
-        return Finding(Reason.PLANNING_FAILED, f"planning failed for its formation: {error}")
+        return Finding(Reason.PLANNING_FAILED, _planning_failed(facts))
     if since_s is not None or never_led:
         return _no_leader(since_s or 0.0)
     return Finding(Reason.NO_PLAN, "no plan for it has come into force")
+
+
+def _planning_failed(facts: Facts) -> str:
+    last = facts.failed[-1] if facts.failed else {}
+    error = last.get("error") or last.get("status")
+    return "planning failed for its formation" + (f" ({error})" if error else "")
 
 
 def _stalled(facts: Facts) -> Finding | None:
