@@ -373,7 +373,7 @@ def _reason(task: SortingTask, name: Name) -> OutOfReach:
 def _holders(task: SortingTask, name: Name) -> tuple[Name, ...]:
     """Return the members that only hold, in a lane between a member's cell and its goal lanes."""
     column, lane = task.hold_cells[name]
-    goal = min(task.goal_lanes[name], key=lambda one: abs(one - lane))
+    goal = min(task.goal_lanes[name], key=lambda one: abs(one - lane), default=lane)
     lanes = range(min(lane, goal), max(lane, goal) + 1)
     movers, bound = task.movers, name in task.column_bound
     holders = [

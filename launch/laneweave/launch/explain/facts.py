@@ -243,6 +243,17 @@ def _add_formation(facts: Facts, event: Event) -> None:
         # One that waited at the end of a lane is in another formation now.
         facts.formations, facts.members = {int(event["formation"])}, {*event["vehicles"]}
         facts.closed_s = float(event["t_s"])
+        # Only now is it known that these vehicles matter.
+        facts.events += [
+            {
+                "t_s": absence.since_s,
+                "kind": kinds.CARETAKER_TOOK_OVER,
+                "vehicle": name,
+                "reason": absence.why,
+            }
+            for name, absence in facts.without_agent.items()
+            if name in facts.members and name != facts.vehicle
+        ]
     elif facts.formations.isdisjoint(event["formations"]):
         return
     else:
