@@ -17,6 +17,7 @@ from laneweave.launch.explain.reasons import Reason
 from laneweave.launch.library.runs import load_scenario, perform_run
 from laneweave.protocol.vehicle.motion import State
 from laneweave.sim_bridge.bodies.motion_controller import MotionController
+from support.bridge_bench import Street, arrival, make_scenario
 from support.variants import variants
 
 COORDINATORS = ("c1", "c2", "c3")
@@ -223,6 +224,19 @@ def test_the_reason_is_right(case: Case, tmp_path: Path, monkeypatch: pytest.Mon
     times = [line.t_s for line in found.story]
     assert times == sorted(times)
     json.dumps(found.to_dict())
+
+
+@pytest.mark.slow
+def test_a_fleet_with_other_settings(tmp_path: Path) -> None:
+    road = {"lanes": 2, "s1_m": 20.0, "s2_m": 20.0, "s3_m": 240.0}
+    demand = [arrival("v0", 1.0, lane=0, preferred_lane=1)]
+    street = Street(make_scenario(road=road), tmp_path, demand, pace=2.0)
+    street.start_coordinators()
+    street.start_shard(scenario=make_scenario(road=road | {"lane_width_m": 5.0}))
+    street.run()
+    found = explain(tmp_path, "v0")
+    assert found.reason == Reason.SETTINGS_REFUSED
+    assert "fleet 0-of-1 has other settings than the bridge (road.lane_width_m)" in found.text
 
 
 @pytest.mark.slow

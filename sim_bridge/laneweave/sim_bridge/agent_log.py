@@ -70,7 +70,7 @@ class AgentLog:
             write = log.warning if change == LOST else log.info
             write(
                 change,
-                fleet=fleet or "unknown",
+                **({"fleet": fleet} if fleet else {}),
                 count=len(vehicles),
                 vehicles=_names(vehicles),
                 road_s=round(begun_s, 3),

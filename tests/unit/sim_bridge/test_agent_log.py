@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from structlog.testing import capture_logs
 
+from laneweave.protocol.scenario.deployment_fields import Shard
 from laneweave.protocol.wire.messages import Name
 from laneweave.sim_bridge.agent_log import AgentLog
+from support.bridge_bench import Street, arrival, make_scenario
 
 VEHICLES = [Name(f"v{number:04}") for number in range(1, 15)]
 EAST, WEST = VEHICLES[::2], VEHICLES[1::2]
@@ -56,8 +60,22 @@ def test_further_changes_of_a_fleet_wait_for_the_next_line() -> None:
         for number in range(1, 15):
             agents.update(VEHICLES[:number], VEHICLES, float(number))
         agents.close(14.0)
-    assert [(line["fleet"], line["count"], line["road_s"]) for line in logged] == [
-        ("unknown", 2, 1.0),
-        ("unknown", 10, 3.0),
-        ("unknown", 2, 13.0),
-    ]
+    assert [(line["count"], line["road_s"]) for line in logged] == [(2, 1.0), (10, 3.0), (2, 13.0)]
+    assert not any("fleet" in line for line in logged)
+
+
+def test_the_bridge_names_the_fleet_that_has_died(tmp_path: Path) -> None:
+    scenario = make_scenario(road={"lanes": 2, "s1_m": 20.0, "s2_m": 20.0, "s3_m": 240.0})
+    arrivals = [arrival(f"v{number}", 1.0 + 2.0 * number, lane=number % 2) for number in range(4)]
+    street = Street(scenario, tmp_path, arrivals, pace=2.0)
+    street.start_coordinators()
+    with capture_logs() as logged:
+        for shard in range(2):
+            street.start_shard(shard, 2)
+        street.run_to(100)
+        lost = sorted(name for name in street.bridge.vehicles if Shard(1, 2).contains(name))
+        street.network.kill("shard-1")
+        street.run()
+    lines = [line for line in logged if line["event"] == "agents lost"]
+    assert lost
+    assert [(line["fleet"], line["vehicles"]) for line in lines] == [("1-of-2", ", ".join(lost))]
