@@ -46,6 +46,7 @@ from laneweave.protocol.wire.topics import (
     REPORT,
     VEHICLE_ALIVE,
 )
+from laneweave.sim_bridge.agent_log import AgentLog
 from laneweave.sim_bridge.deployment import Deployment
 from laneweave.sim_bridge.recording.record_interface import Record
 from laneweave.sim_bridge.road.caretakers import notify_left
@@ -180,6 +181,7 @@ class BridgeCore:
         self._stopwatch = stopwatch
         self._tick_began = 0.0
         self._deployment = Deployment(scenario, incarnation, record)
+        self._agent_log = AgentLog(self._deployment.fleet_of)
         self._opened_s = self._census_s = 0.0
         """When the current tick was opened; when the census is published next if it waits."""
         self._ending = Ending.COMPLETE
@@ -338,6 +340,7 @@ class BridgeCore:
             if now_s >= self._until_s:
                 self._enter()
                 yield from self.road.begin_tick(now_s)
+                self._agent_log.update(self.road.caretakers.vehicles, self.vehicles, self.t_s)
                 self.phase = TickPhase.ANSWERS
             elif now_s >= self._census_s:
                 # A fleet that was restarted learns of its vehicles.
@@ -420,6 +423,7 @@ class BridgeCore:
     def _finish(self, ending: Ending) -> None:
         if self.phase is not TickPhase.ENDED:
             self.phase = TickPhase.ENDED
+            self._agent_log.close(self.t_s)
             for arrival in self._roadside.outside.never_came if ending is Ending.COMPLETE else ():
                 self._record.on_demanded(arrival)
             for vehicle in self.vehicles.values():

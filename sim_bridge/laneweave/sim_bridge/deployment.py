@@ -50,7 +50,8 @@ from laneweave.sim_bridge.recording.record_interface import Record
 FLEET = ROLES[Party.FLEET]
 COORDINATOR = ROLES[Party.COORDINATOR]
 MAX_REFUSED = 1000
-"""Maximum number of processes that do not fit for which an event is recorded."""
+"""Maximum number of processes that do not fit for which an event is recorded, and of fleets whose
+names are kept."""
 
 Key = tuple[str, str, str]
 """Role, name and incarnation of a process."""
@@ -69,6 +70,8 @@ class Deployment:
         self._lease_s = scenario.network.lease_s
         self._fleets: dict[Key, Shard] = {}
         """Shards of the fleets with tokens."""
+        self._known_shards: dict[str, Shard] = {}
+        """Shards of all fleets that have been there, by name."""
         self._has_fleets = False
         """Whether a fleet has ever been there: then all agents are started by fleets."""
         self._absence_counts_s = math.inf
@@ -150,10 +153,17 @@ class Deployment:
                 return
             self._has_fleets = True
             self._fleets[_key(parameters)] = shard
+            if len(self._known_shards) < MAX_REFUSED or parameters["name"] in self._known_shards:
+                self._known_shards[parameters["name"]] = shard
 
     def _starters(self, vehicle: str) -> list[Key | None]:
         """Return the processes that can start a vehicle's agent; None: one that is not known."""
         return [key for key, shard in self._fleets.items() if shard.contains(vehicle)] or [None]
+
+    def fleet_of(self, vehicle: str) -> str:
+        """Return the fleet that drives a vehicle, or last drove it; empty: none is known."""
+        known = (name for name, shard in self._known_shards.items() if shard.contains(vehicle))
+        return next(known, "")
 
     def wait_s(self, vehicle: Name, now_s: float) -> float:
         """Return how long the road waits for the agent of a vehicle at the entrance.

@@ -36,6 +36,7 @@ from laneweave.protocol.lattice import Cell
 from laneweave.protocol.runtime.node import Compute, Computed
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.plans import plan_problems
+from laneweave.protocol.wire import reasons
 from laneweave.protocol.wire.events import (
     FORMATION_TOO_LATE,
     FORMATIONS_JOINED,
@@ -120,6 +121,8 @@ class FormationPlanner:
         """Id, formation and ballot of the current computation."""
         self.pace = RoadPace()
         """Pace of the road, for deadlines."""
+        self.leading_since_s: float | None = None
+        """Road time since which this coordinator leads; None: it does not."""
         formation = scenario.formation
         oblique = formation.weight_oblique
         weights = Weights(
@@ -128,8 +131,9 @@ class FormationPlanner:
         self._make_plan = partial(plan, weights=weights)
 
     def forget(self) -> None:
-        """Discard all waiting requests."""
+        """Discard all waiting requests; the coordinator has begun or stopped leading."""
         self._waiting.clear()
+        self.leading_since_s = None
 
     def _deadline_s(self, start_s: float, t_s: float) -> float:
         """Return the scenario's deadline if given, else the time until the first move."""
@@ -165,8 +169,8 @@ class FormationPlanner:
             leader.take(FAILED, now_s)
             return
         if steps_left(cells, start_s, scenario.timing.cycles_s[0], scenario) == 0:
+            yield LogEntry(FORMATION_TOO_LATE, self._too_late(leader, cells))
             leader.take(TOO_LATE, now_s)
-            yield LogEntry(FORMATION_TOO_LATE, {"formation": numbers[0]})
             return
         task = SortingTask(
             numbers,
@@ -184,6 +188,7 @@ class FormationPlanner:
                 for member in formation.members
                 if (moves := scenario.types.moves_of(member.vehicle_type)) is not None
             },
+            too_late=too_late - leader.unattended,
         )
         nodes = scenario.formation.max_nodes * 2 ** min(leader.failures, MAX_DOUBLINGS)
         # Replaces a request under an earlier ballot, at the end of the queue.
@@ -191,6 +196,43 @@ class FormationPlanner:
         # The job detects invalid promises; they are handled like any planning failure.
         self._waiting[numbers[0]] = ballot, partial(sort_lanes, task, nodes, self._make_plan)
         yield from self._begin()
+
+    def _too_late(self, leader: FormationLeader, cells: Collection[Cell]) -> dict[str, object]:
+        """Return who does not sort its lane because it is too late for any step, and why.
+
+        Args:
+            leader: leader of the formation.
+            cells: cells of the members that count for the time left.
+        """
+        formation, goals = leader.formation, leader.formation.goal_lanes
+        off_lane = [
+            str(name)
+            for name, cell in leader.hold_cells.items()
+            if formation.sorts and cell[1] not in goals[name]
+        ]
+        closed_s, since_s = formation.closed_s, self.leading_since_s or 0.0
+
+        def was_too_late(t_s: float) -> bool:
+            start_s, slot_s = (
+                self._start_s(formation, cells, t_s),
+                self._scenario.timing.cycles_s[0],
+            )
+            return steps_left(cells, start_s, slot_s, self._scenario) == 0
+
+        if was_too_late(closed_s):
+            reason = reasons.ROAD_TOO_SHORT
+        elif was_too_late(since_s):
+            reason = reasons.NO_LEADER
+        else:
+            failed = leader.failures > 0
+            reason = reasons.PLANNING_FAILED if failed else reasons.LATE_PROMISES
+        return {
+            "formation": formation.numbers[0],
+            "vehicles": off_lane,
+            "reason": reason,
+            "closed_s": closed_s,
+            "since_s": since_s,
+        }
 
     def _ends_s(self, leader: FormationLeader) -> dict[Name, float]:
         """Return until when the members that have to change lanes can do so (road time)."""
@@ -360,11 +402,16 @@ def _log_entries(
         yield LogEntry(PLAN_MADE, data | {"t0_s": plan.t0_s, "slot_s": plan.slot_s})
     if pauses:
         yield LogEntry(NEIGHBOURS_AWAITED, {"formation": number, "slots": pauses})
-    missed = [
-        str(member.vehicle)
+    missed = {
+        str(member.vehicle): sorting.reasons[member.vehicle]
         for member in formation.members
         if member.vehicle in sorting.out_of_reach
         and stage.is_last_for(member.preferred_lane, member.destination)
-    ]
+    }
     if missed:
-        yield LogEntry(LANE_OUT_OF_REACH, {"formation": number, "vehicles": missed})
+        data = {"formation": number, "vehicles": list(missed)}
+        data["reasons"] = {name: one.reason for name, one in missed.items()}
+        data["blocked_by"] = {
+            name: list(one.blocked_by) for name, one in missed.items() if one.blocked_by
+        }
+        yield LogEntry(LANE_OUT_OF_REACH, data)

@@ -46,6 +46,8 @@ promise that outbids the leader."""
 RETRY_S = 1.0
 """First pause after failed planning; it doubles with each failure (L5)."""
 LONGEST_RETRY_S = 8.0
+AWAITED_S = 3.0
+"""Time after which a leader logs the vehicles whose promises or acceptances a ballot lacks."""
 
 
 @define
@@ -66,6 +68,8 @@ class FormationLeader(BallotRound):
     """`age` of each of these states."""
     highest: Ballot | None = None
     """Highest ballot that a member has reported; members promise only higher ones."""
+    awaited_log_s: float | None = None
+    """Time at which to log the vehicles that the ballot awaits (node clock); None: not again."""
 
     @property
     def roster(self) -> tuple[Name, ...]:
@@ -122,6 +126,22 @@ class FormationLeader(BallotRound):
         self.out_of_reach = frozenset(out_of_reach)
         self.take(PLANNED, now_s, plan)
 
+    def pop_awaited(self, now_s: float) -> tuple[Name, ...]:
+        """Return the vehicles that have not answered a ballot for `AWAITED_S`; once per ballot."""
+        if self.awaited_log_s is None or now_s < self.awaited_log_s:
+            return ()
+        match self.phase:
+            case BallotPhase.PREPARING:
+                answered = set(self.promises)
+            case BallotPhase.ISSUING:
+                answered = self.accepted
+            case _:
+                return ()
+        awaited = tuple(name for name in self.roster if name not in answered)
+        if awaited:
+            self.awaited_log_s = None
+        return awaited
+
     def _is_news(self, state: VehicleState, now_s: float) -> bool:
         """Return whether a state is from a member and not older than the member's newest one."""
         name = state.vehicle
@@ -177,6 +197,7 @@ def prepare(leader: FormationLeader, _: object) -> None:
     leader.accepted = set()
     leader.failures = 0
     leader.due_s = leader.now_s
+    leader.awaited_log_s = leader.now_s + AWAITED_S
 
 
 def back_off(leader: FormationLeader, _: object) -> None:

@@ -14,7 +14,7 @@ from laneweave.coordinator.planning.response import PlanFunction
 from laneweave.protocol.runtime.node import Compute, Computed, Effect
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.state_machine import RuleBook
-from laneweave.protocol.wire.events import FORMATIONS_JOINED, PLAN_IN_FORCE
+from laneweave.protocol.wire.events import FORMATIONS_JOINED, PLAN_IN_FORCE, VEHICLES_AWAITED
 from laneweave.protocol.wire.messages import Ballot, Census, VehicleState
 
 JUST_CLOSED_S = 1.0
@@ -89,6 +89,8 @@ class FormationsOperation:
         self, census: Census, t_s: float, now_s: float, *, changed: bool
     ) -> Iterator[Effect | LogEntry]:
         """Update members, handle expired timers, request plans, send messages."""
+        if self._planner.leading_since_s is None:
+            self._planner.leading_since_s = t_s
         if changed or self._groups.changed:
             yield from self._update_members(census, t_s, now_s)
             self._groups.changed = False
@@ -100,6 +102,9 @@ class FormationsOperation:
                 yield from self._planner.order(leader, t_s, now_s)
             for vehicle, message in leader.outgoing(now_s):
                 yield to_vehicle(vehicle, message)
+            if awaited := leader.pop_awaited(now_s):
+                data = {"formation": leader.formation.numbers[0], "vehicles": list(awaited)}
+                yield LogEntry(VEHICLES_AWAITED, data | {"phase": leader.phase.value})
 
     def _update_members(self, census: Census, t_s: float, now_s: float) -> Iterator[LogEntry]:
         formations = closed_formations(census, t_s, self._scenario, self._groups)

@@ -35,6 +35,7 @@ from laneweave.protocol.lattice import Cell, PlannedMove
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.formation_table import DrivingStructure
 from laneweave.protocol.wire.messages import Name
+from laneweave.protocol.wire.reasons import BLOCKED, CLOSED_LANE, NO_AGENT, NO_ROOM, TOO_LATE
 
 MAX_PLACEMENTS = 6
 """Maximum number of target placements to try if the first one takes too many steps."""
@@ -68,6 +69,8 @@ class SortingTask:
     """Stage of the road; its closed lanes are not used. None: all lanes are open."""
     moves: Mapping[Name, frozenset[Cell]] = field(factory=dict)
     """Moves (columns, lanes) that members of some types can drive; others drive all."""
+    too_late: Collection[Name] = frozenset()
+    """Those of `unattended` that have agents, but are too late for the stage."""
 
     @property
     def columns(self) -> range:
@@ -137,6 +140,16 @@ class SortingTask:
 
 
 @frozen
+class OutOfReach:
+    """Why a member does not reach its lane."""
+
+    reason: str
+    """`TOO_LATE`, `NO_AGENT`, `CLOSED_LANE`, `BLOCKED` or `NO_ROOM` (`wire.reasons`)."""
+    blocked_by: tuple[Name, ...] = ()
+    """Members that hold cells on its way, nearest first."""
+
+
+@frozen
 class Sorting:
     """Result of lane sorting."""
 
@@ -151,6 +164,8 @@ class Sorting:
     could help."""
     impossible: str = ""
     """Why the structure has too few cells, in which case no member moves; empty: it has enough."""
+    reasons: Mapping[Name, OutOfReach] = field(factory=dict)
+    """Why each of `out_of_reach` does not reach its lane."""
 
     @property
     def solved(self) -> bool:
@@ -334,4 +349,45 @@ def _sorting(task: SortingTask, response: PlanResponse | None) -> Sorting:
     known = response is not None and response.status != "timeout"
     short = {*missed}.difference(task.unattended)
     short_of_room = known and bool(short) and not task.hindered.issuperset(short)
-    return Sorting(response, moves, missed, short_of_room)
+    return Sorting(response, moves, missed, short_of_room, reasons=_out_of_reach(task, missed))
+
+
+def _out_of_reach(task: SortingTask, missed: Iterable[Name]) -> dict[Name, OutOfReach]:
+    """Return why each of the given members does not reach a goal lane."""
+    return {name: _reason(task, name) for name in missed}
+
+
+def _reason(task: SortingTask, name: Name) -> OutOfReach:
+    if name in task.too_late:
+        return OutOfReach(TOO_LATE)
+    if name in task.unattended:
+        return OutOfReach(NO_AGENT)
+    if name not in task.movers:
+        return OutOfReach(CLOSED_LANE)
+    holders = _holders(task, name)
+    if holders and not _overfull(task, name):
+        return OutOfReach(BLOCKED, holders)
+    return OutOfReach(NO_ROOM)
+
+
+def _holders(task: SortingTask, name: Name) -> tuple[Name, ...]:
+    """Return the members that only hold, in a lane between a member's cell and its goal lanes."""
+    column, lane = task.hold_cells[name]
+    goal = min(task.goal_lanes[name], key=lambda one: abs(one - lane), default=lane)
+    lanes = range(min(lane, goal), max(lane, goal) + 1)
+    movers, bound = task.movers, name in task.column_bound
+    holders = [
+        other
+        for other, cell in task.hold_cells.items()
+        if other not in movers and cell[1] in lanes and (cell[0] == column or not bound)
+    ]
+    return tuple(sorted(holders, key=lambda other: abs(task.hold_cells[other][0] - column)))
+
+
+def _overfull(task: SortingTask, name: Name) -> bool:
+    """Return whether more members want a member's goal lanes than these have cells in all."""
+    goals, lattice = task.goal_lanes[name], task.scenario.lattice
+    wanting = sum(lanes <= goals for lanes in task.goal_lanes.values())
+    usable = {*task.numbers} - {*task.deserted}
+    columns = sum(lattice.block_of(column) in usable for column in task.columns)
+    return wanting > columns * len(goals & task.open_lanes)

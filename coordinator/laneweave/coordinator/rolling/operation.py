@@ -190,6 +190,7 @@ class RollingOperation:
         if not isinstance(plan, StreamPlan):
             yield LogEntry(PLANNING_FAILED, {"slot": slot, "error": computed.error})
             return
+        known = set() if self._last_plan is None else {*self._last_plan.missed}
         self._last_plan = plan
         t0_s = slot * self._slot_s
         if t_s > t0_s + MAX_DELAY_S:
@@ -197,7 +198,8 @@ class RollingOperation:
             return
         self.transfers = list(self._make_transfers(plan, t0_s, now_s))
         self._transfer_of = {name: each for each in self.transfers for name in each.roster}
-        yield LogEntry(STREAM_PLANNED, self._log_data(plan))
+        out_of_reach = [name for name in plan.missed if name not in known]
+        yield LogEntry(STREAM_PLANNED, self._log_data(plan) | {"out_of_reach": out_of_reach})
 
     def _log_data(self, plan: StreamPlan) -> dict[str, Any]:
         sizes = [len(transfer.roster) for transfer in self.transfers]

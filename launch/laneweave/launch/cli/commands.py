@@ -78,6 +78,11 @@ COMMANDS = {
         "report",
         "Write figures and a page for each finished run, and for a sweep or several runs together.",
     ),
+    "explain": CommandEntry(
+        "explain_command",
+        "explain",
+        "Tell what happened to a vehicle in a run, and why it missed its lane.",
+    ),
     "repair": CommandEntry(
         "study_commands",
         "repair",

@@ -11,6 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from attrs import frozen
 
+from laneweave.launch.explain.explanation import Explanation, explain
 from laneweave.launch.recordings.runs import not_a_run, scenario_of, unreadable
 from laneweave.launch.recordings.trajectories import read_trajectories
 from laneweave.protocol.scenario.fields import Scenario
@@ -74,6 +75,16 @@ class RecordedRun:
         except (OSError, ValueError) as error:
             raise not_a_run(self.folder, error) from error
         return [event for event in events if kind is None or event["kind"] == kind]
+
+    def explain(self, vehicle: str) -> Explanation:
+        """Return what happened to a vehicle, and why it missed its lane, if it did.
+
+            print(laneweave.load_run("runs/demo").explain("v0039").text)
+
+        Raises:
+            BadInputError: there is no such vehicle, or the events cannot be read.
+        """
+        return explain(self.folder, vehicle)
 
     def _table(self, name: str) -> pa.Table:
         try:

@@ -182,13 +182,15 @@ class _LiveObserver:
         """Return whether nothing is wrong with the deployment, and this observer makes frames."""
         age_s = self._wall_s() - self._made_s
         view, findings = self._road.view, self._road.findings
+        makes_frames = age_s < 3.0 * IDLE_S
         facts = {
+            "serving": view.linked and makes_frames,
             "connected": view.linked,
             "runs": view.roads,
             "frame_age_s": round(age_s, 3),
             "findings": [attrs.asdict(one) for one in findings],
         }
-        return not findings and age_s < 3.0 * IDLE_S, facts
+        return not findings and makes_frames, facts
 
     def metrics(self) -> bytes:
         """Return metrics of the findings in the Prometheus text format."""

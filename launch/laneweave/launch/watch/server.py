@@ -111,7 +111,7 @@ class Browsers:
 
 
 Health = Callable[[], tuple[bool, dict[str, Any]]]
-"""Returns whether the server is healthy, and details."""
+"""Returns whether what is shown is healthy, and details; `serving`: whether the server itself is."""
 
 
 Metrics = Callable[[], bytes]
@@ -134,6 +134,11 @@ def make_app(
         facts = {"ok": healthy, **facts, "browsers": len(browsers.connected)}
         return JSONResponse(facts, status_code=200 if healthy else 503, headers=HEADERS)
 
+    async def livez(_request: Request) -> Response:
+        _, facts = health()
+        serving = bool(facts.get("serving", True))
+        return JSONResponse({"ok": serving}, status_code=200 if serving else 503, headers=HEADERS)
+
     async def show_metrics(_request: Request) -> Response:
         return Response(metrics(), media_type=METRICS_TYPE, headers=HEADERS)
 
@@ -152,6 +157,7 @@ def make_app(
             Route("/road.js", _answer(road_script(), "text/javascript")),
             Route("/closed_parts.js", _answer(closed_parts_script(), "text/javascript")),
             Route("/healthz", healthz),
+            Route("/livez", livez),
             Route("/metrics", show_metrics),
             WebSocketRoute("/stream", stream),
         ]

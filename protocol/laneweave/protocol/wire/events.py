@@ -37,6 +37,8 @@ NEIGHBOURS_AWAITED: Final = "neighbours-awaited"
 """Coordinator: a plan pauses to avoid closing moves with a neighbouring formation."""
 LANE_OUT_OF_REACH: Final = "lane-out-of-reach"
 """Coordinator: a plan leaves vehicles off their preferred lanes."""
+VEHICLES_AWAITED: Final = "vehicles-awaited"
+"""Coordinator: vehicles have not answered a ballot for 3 s, and so their formation has no plan."""
 FORMATION_CLOSED: Final = "formation-closed"
 """Bridge: a formation accepts no more vehicles."""
 ENTERED: Final = "entered"
@@ -76,13 +78,14 @@ PLAN_EVENTS: Final = (PLAN_MADE, STREAM_PLANNED)
 FIELDS: Final[Mapping[str, tuple[str, ...]]] = {
     LEADER_ELECTED: ("term",),
     LEADER_STEPPED_DOWN: ("term",),
-    LEADER: ("coordinator", "term"),
+    LEADER: ("coordinator", "term", "leader_until_s"),
     PLAN_MADE: (
         *("formation", "vehicles", "status", "cost", "lower_bound", "steps", "solve_ms"),
         *("assignments_tried", "nodes_expanded", "solver", "fallback", "t0_s", "slot_s"),
     ),
     STREAM_PLANNED: (
         *("slot", "vehicles", "missed", "moves", "ballots", "largest", "status", "solve_ms"),
+        "out_of_reach",
     ),
     PLAN_IN_FORCE: ("formation", "slot", "closed_s"),
     PLANNING_FAILED: ("formation", "slot", "status", "error"),
@@ -90,15 +93,19 @@ FIELDS: Final[Mapping[str, tuple[str, ...]]] = {
     TRANSFER_ABORTED: ("roster", "why"),
     STRUCTURE_TOO_LATE: ("formation", "stage"),
     STRUCTURE_IMPOSSIBLE: ("formation", "stage", "why"),
-    FORMATION_TOO_LATE: ("formation",),
+    FORMATION_TOO_LATE: ("formation", "vehicles", "reason", "closed_s", "since_s"),
     FORMATIONS_JOINED: ("formations", "why"),
     ROOM_AWAITED: ("formation",),
     NEIGHBOURS_AWAITED: ("formation", "slots"),
-    LANE_OUT_OF_REACH: ("formation", "vehicles"),
+    LANE_OUT_OF_REACH: ("formation", "vehicles", "reasons", "blocked_by"),
+    VEHICLES_AWAITED: ("formation", "vehicles", "phase"),
     FORMATION_CLOSED: ("formation", "vehicles", "columns"),
     ENTERED: ("vehicle", "lane", "preferred_lane", "destination", "formation"),
     LEFT: ("vehicle", "lane", "exit", "on_preferred_lane"),
-    LEFT_OFF_LANE: ("vehicle", "lane", "exit", "preferred_lane", "destination", "attended"),
+    LEFT_OFF_LANE: (
+        *("vehicle", "lane", "exit", "preferred_lane", "destination", "attended"),
+        *("reason", "unattended_since_s", "leader_until_s"),
+    ),
     LEFT_LATTICE: ("vehicle", "lane"),
     MISSED_EXIT: ("vehicle", "lane"),
     DRIVES_OUT: ("vehicle", "lane"),
@@ -110,7 +117,7 @@ FIELDS: Final[Mapping[str, tuple[str, ...]]] = {
     COMMAND_REFUSED: ("vehicle", "reason", "excess_m", "occupant"),
     SETTINGS_REFUSED: ("process", "incarnation", "settings"),
     OVERLAP: ("vehicles",),
-    RUN_ENDED: ("ending",),
+    RUN_ENDED: ("ending", "leader_until_s"),
 }
 """Data of each event, beside `COMMON_FIELDS`."""
 COMMON_FIELDS: Final = ("t_s", "kind", "role", "name")
@@ -155,13 +162,24 @@ MEANINGS: Final[Mapping[str, str]] = {
     "exit": "name of the exit by which the vehicle left; end: end of the road",
     "on_preferred_lane": "whether the vehicle left where it wanted to",
     "attended": "whether its agent was in charge, not a caretaker",
-    "reason": "why the agent was not in charge; what is wrong with the command",
+    "reason": "why the lane was missed (wire/reasons.py); why the agent was not in charge; what is "
+    "wrong with the command",
+    "reasons": "reason of each vehicle (wire/reasons.py)",
+    "blocked_by": "for each blocked vehicle, those that hold cells on its way, nearest first",
+    "out_of_reach": "names of the vehicles that `missed` counts for the first time",
+    "phase": "preparing: promises are missing; issuing: acceptances of the plan",
+    "since_s": "road time since which the sender leads [s]",
+    "unattended_since_s": "road time since which no agent was in charge [s]; null: one was",
+    "leader_until_s": "road time of the last heartbeat of a leader before [s]; null: none",
     "occupant": "vehicle, or gap for one, that occupies a cell on the way",
     "incarnation": "start time of the process [ns]",
     "settings": "settings that differ: pairs of the value of the bridge and that of the process",
     "process": "role and name of the process",
     "excess_m": "how far the command would have led the body out of its cells [m]",
     "previous": "who was in charge before: caretaker or agent",
+    "process": "role and name of the process that was refused",
+    "incarnation": "incarnation of this process",
+    "settings": "settings that differ: value of the bridge, value of the process",
     "ending": "as in summary.json",
 }
 """What each field means."""

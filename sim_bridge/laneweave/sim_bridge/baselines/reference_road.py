@@ -67,6 +67,10 @@ class ReferenceVehicle:
         """None, since the vehicle reserves no cells."""
 
     @property
+    def has_plan(self) -> None:
+        """None: reference methods make no plans."""
+
+    @property
     def level_ticks(self) -> Mapping[FallbackLevel, int]:
         """Empty, since there is no motion controller."""
         return {}

@@ -65,6 +65,8 @@ from laneweave.sim_bridge.bodies.motion_controller import FallbackLevel
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import MinGaps
 from laneweave.sim_bridge.recording.disk import Disk
 from laneweave.sim_bridge.recording.events import Events
+from laneweave.sim_bridge.recording.leadership import Leadership
+from laneweave.sim_bridge.recording.missed_lanes import MissedLanes, leaderless_after_s
 from laneweave.sim_bridge.recording.reports import ReportTotals
 from laneweave.sim_bridge.recording.ticks import Ticks
 from laneweave.sim_bridge.recording.trajectories import Sample, Trajectories
@@ -106,19 +108,12 @@ class RecordedVehicle(Protocol):
         """Cell that the vehicle holds or moves to; None: the method has no lattice."""
 
     @property
+    def has_plan(self) -> bool | None:
+        """Whether the process in charge has accepted a plan; None: the method makes no plans."""
+
+    @property
     def level_ticks(self) -> Mapping[FallbackLevel, int]:
         """Ticks on each fallback level; empty without a motion controller."""
-
-
-@define
-class _Leadership:
-    """Leadership as reported by heartbeats."""
-
-    leader: tuple[Name, int] | None = None
-    term: int = 0
-    last_heartbeat_s: float = 0.0
-    changes: int = 0
-    recovery_s: list[float] = field(factory=list)
 
 
 @define
@@ -183,7 +178,8 @@ class RunRecord:
         except OSError as error:
             text = f"{folder}: the run cannot be recorded: {error.strerror or error}"
             raise CommandFailedError(text) from error
-        self._leadership = _Leadership()
+        self._leadership = Leadership(scenario.network.election_s)
+        self._missed_lanes = MissedLanes(leaderless_after_s(scenario))
         self._reports = ReportTotals()
         self._level_ticks: Counter[FallbackLevel] = Counter()
         self._counts = _Counts()
@@ -282,6 +278,12 @@ class RunRecord:
         self._counts.missed_exits += trip.exit != arrival.destination
         self._level_ticks.update(vehicle.level_ticks)
         self._counts.left_unattended += not attended
+        reasons = self._missed_lanes.pop(
+            Name(vehicle.name),
+            t_s,
+            planned=vehicle.has_plan,
+            leader_until_s=self._leadership.until_s,
+        )
         where = {"vehicle": vehicle.name, "lane": lane, "exit": trip.exit}
         self.event(left_s, LEFT, **where, on_preferred_lane=at_destination)
         if not at_destination:
@@ -292,10 +294,12 @@ class RunRecord:
                 preferred_lane=arrival.preferred_lane,
                 destination=arrival.destination,
                 attended=attended,
+                **reasons,
             )
 
     def on_lane_end(self, t_s: float, vehicle: Name, lane: int, kind: str) -> None:
         """Record that a vehicle has left the lattice at a dead end, or comes back; see `events`."""
+        self._missed_lanes.on_lane_end(vehicle, kind)
         if kind == LEFT_LATTICE:
             self._counts.stopped.add(vehicle)
         self.event(t_s, kind, vehicle=vehicle, lane=lane)
@@ -327,11 +331,13 @@ class RunRecord:
     def on_caretaker_took_over(self, t_s: float, vehicle: Name, reason: str) -> None:
         """Record that a caretaker has taken charge; `reason` is an `Absence`."""
         self._counts.caretaker_takeovers += 1
+        self._missed_lanes.on_caretaker(t_s, vehicle)
         self.event(t_s, CARETAKER_TOOK_OVER, vehicle=vehicle, reason=reason)
 
     def on_agent_took_over(self, t_s: float, vehicle: Name, previous: str) -> None:
         """Record that an agent has taken charge from the `caretaker` or an earlier `agent`."""
         self._counts.agent_takeovers += 1
+        self._missed_lanes.on_agent(vehicle)
         self.event(t_s, AGENT_TOOK_OVER, vehicle=vehicle, previous=previous)
 
     def on_positions(
@@ -379,26 +385,10 @@ class RunRecord:
         self._reports.add(report)
 
     def on_heartbeat(self, heartbeat: Heartbeat, t_s: float, now_s: float) -> None:
-        """Record leader changes and leaderless periods; `now_s` is the node's clock.
-
-        A leader that was paused claims to lead until it hears of its successor, which has a higher
-        term: this is no change.
-        """
-        leadership = self._leadership
-        sender = (heartbeat.coordinator, heartbeat.incarnation)
-        if not heartbeat.leading:
-            return
-        silence_s = now_s - leadership.last_heartbeat_s
-        if leadership.leader is not None and sender != leadership.leader:
-            outdated = heartbeat.term <= leadership.term
-            if outdated and silence_s < self._scenario.network.election_s:
-                return
-            leadership.changes += 1
-            leadership.recovery_s.append(round(silence_s, 4))
-        if sender != leadership.leader:
-            leadership.leader = sender
-            self.event(t_s, LEADER, coordinator=heartbeat.coordinator, term=heartbeat.term)
-        leadership.term, leadership.last_heartbeat_s = heartbeat.term, now_s
+        """Record leader changes and leaderless periods; `now_s` is the node's clock."""
+        leader = self._leadership.on_heartbeat(heartbeat, t_s, now_s)
+        if leader is not None:
+            self.event(t_s, LEADER, **leader)
 
     # --- the end ------------------------------------------------------------------------------
 
@@ -406,7 +396,8 @@ class RunRecord:
         """Write all files; only the first call has an effect."""
         if self._closed:
             return
-        self.event(t_s, RUN_ENDED, ending=ending.value)
+        until_s = self._leadership.until_s
+        self.event(t_s, RUN_ENDED, ending=ending.value, leader_until_s=until_s)
         self._closed = True
         with self._disk.writing(), ExitStack() as closing:
             for file in (self._events, self._trajectories, self._trips, self._ticks):

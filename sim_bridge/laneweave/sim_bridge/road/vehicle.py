@@ -123,6 +123,11 @@ class RoadVehicle:
         return self.controller.hold_cell
 
     @property
+    def has_plan(self) -> bool:
+        """Whether the process in charge has accepted a plan."""
+        return self.controller.record.accepted is not None
+
+    @property
     def level_ticks(self) -> Mapping[FallbackLevel, int]:
         """Ticks on each fallback level."""
         return self.controller.level_ticks

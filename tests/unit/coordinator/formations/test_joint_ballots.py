@@ -76,7 +76,9 @@ def test_without_joining_all_but_one_get_their_lane_and_that_is_logged() -> None
     ends = {name: moves[-1][2] if moves else FULL[name] for name, moves in plan.moves.items()}
     missed = [name for name, cell in ends.items() if cell[1] != 1]
     assert len(missed) == 1
-    assert notes(effects, "lane-out-of-reach") == [{"formation": 0, "vehicles": missed}]
+    (note,) = notes(effects, "lane-out-of-reach")
+    assert (note["formation"], note["vehicles"]) == (0, missed)
+    assert (note["reasons"], note["blocked_by"]) == ({missed[0]: "no-room"}, {})
     assert desk.leaders[0].out_of_reach == {*missed}
 
 
@@ -324,7 +326,8 @@ def test_a_vehicle_without_an_agent_keeps_its_cell_and_the_others_drive_around_i
     assert (plan.moves[A], plan.start_cells[A]) == ((), cells[A])
     assert plan.moves[B][-1][2][1] == 0
     assert all(cells[A] not in move[1:] for move in plan.moves[B])
-    assert notes(effects, "lane-out-of-reach") == [{"formation": 0, "vehicles": [A]}]
+    (note,) = notes(effects, "lane-out-of-reach")
+    assert (note["vehicles"], note["reasons"]) == ([A], {A: "no-agent"})
 
 
 def test_when_no_vehicle_can_be_moved_the_plan_has_no_moves() -> None:
@@ -350,4 +353,5 @@ def test_a_lane_that_only_vehicles_without_agents_miss_joins_no_formations() -> 
     (job,) = jobs(desk.promise(mine, unattended=[A]))
     effects = desk.give(run_job(job))
     assert plan_of(effects).blocks == (0,)
-    assert notes(effects, "lane-out-of-reach") == [{"formation": 0, "vehicles": [A]}]
+    (note,) = notes(effects, "lane-out-of-reach")
+    assert (note["vehicles"], note["reasons"]) == ([A], {A: "no-agent"})

@@ -37,6 +37,10 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     [
         (["fly"], "fly"),
         (["run", "--wings", "2"], "--wings"),
+        (
+            ["explain", ".", "v0001"],
+            "RUN: got '.'; allowed: the folder of a run, with events.jsonl",
+        ),
         (["run", "a.toml", "b.toml"], "b.toml"),
         (["run", "--volume", "-5"], "demand.volume_veh_per_lane_h: got -5.0; allowed: (0, 3600]"),
         (["run", "--method", "magic"], "magic"),
