@@ -111,7 +111,7 @@ class Browsers:
 
 
 Health = Callable[[], tuple[bool, dict[str, Any]]]
-"""Returns whether what is shown is healthy, and details; `serving`: whether the server itself is."""
+"""Returns whether what is shown is healthy, and details, with `serving`: whether the server is."""
 
 
 Metrics = Callable[[], bytes]
