@@ -56,7 +56,7 @@ class MissedLanes:
         Args:
             vehicle: its name.
             t_s: road time.
-            planned: whether the process in charge has accepted a plan; None: nobody makes plans.
+            planned: whether the process in charge has accepted a plan; None: the method makes none.
             leader_until_s: road time of the newest heartbeat of a leader; None: there was none.
         """
         since_s = self._unattended_since_s.pop(vehicle, None)
