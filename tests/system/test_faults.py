@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -208,6 +209,58 @@ def test_each_group_is_cut_off_for_some_time(lab: Lab, short: Path) -> None:
     assert found["messages"]["dropped_by_faults"] == 0
     # The bridge lost sight of its agents, and drives those that are left in their stead.
     assert events(lab.folder / "out", "caretaker-took-over")
+
+
+@pytest.mark.more
+def test_rules_between_single_processes(lab: Lab, short: Path) -> None:
+    """The agent that hears nothing of the road is the only one that a caretaker replaces."""
+    faults = lab.path(
+        "faults.toml",
+        '[[messages]]\nfrom = "bridge"\nto = "v0003"\nloss = 1\nuntil_s = 20\n'
+        '[[messages]]\nbetween = ["v0001", "v0002"]\nloss = 1\n'
+        '[[messages]]\nfrom = "c1"\nto = "v0005"\nloss = 1\n'
+        '[[pause]]\ntarget = "c2"\nat_s = 9\nfor_s = 0.5\n'
+        '[[kill]]\ntarget = "v0004"\nat_s = 9\nrestart_after_s = 0.2\n',
+    )
+
+    found = run_with(lab, short, faults, "--pace", "5", "--duration", "10")
+
+    folder = lab.folder / "out"
+    assert found["messages"]["dropped_by_faults"] > 0
+    silent = {event["vehicle"] for event in events(folder, "agent-silent")}
+    assert silent == {"v0003"}
+    injected = events(folder, "fault-injected")
+    assert {(one["fault"], one["action"], one["target"]) for one in injected} == {
+        ("messages[0]", "began", "bridge to v0003"),
+        ("messages[0]", "ended", "bridge to v0003"),
+        ("messages[1]", "began", "v0001 and v0002"),
+        ("messages[2]", "began", "c1 to v0005"),
+        ("pause[0]", "paused", "c2"),
+        ("pause[0]", "resumed", "c2"),
+        ("kill[0]", "killed", "agent-v0004"),
+        ("kill[0]", "restarted", "agent-v0004"),
+    }
+    assert [one["run_s"] for one in injected] == sorted(one["run_s"] for one in injected)
+
+
+@pytest.mark.more
+def test_a_run_ends_with_its_killed_bridge(lab: Lab, short: Path) -> None:
+    faults = lab.path("faults.toml", '[[kill]]\ntarget = "bridge"\nat_s = 12\n')
+    folder = lab.folder / "out"
+
+    ended = lab.run(
+        *("run", short, *DEMAND, "--pace", "3", "--vehicles-per-process", "8"),
+        *("--faults", faults, "--out", folder),
+    )
+
+    assert ended.status == 1
+    (line,) = [line for line in ended.out.splitlines() if line.startswith("FAILED: ")]
+    assert re.fullmatch(r"FAILED: the bridge was killed at 12\.\d s by kill\[0\]", line)
+    assert summary(folder)["ending"] == "unfinished"
+    (event,) = events(folder, "fault-injected")
+    assert (event["action"], event["target"]) == ("killed", "bridge")
+    assert lab.run("repair", folder).status == 0
+    lab.check_nothing_left()
 
 
 @pytest.mark.more

@@ -24,6 +24,7 @@ from laneweave.protocol.runtime.message_faults import SENDERS, MessageRule
 from laneweave.protocol.structuring import NumberOrRange, structure
 
 LEADER, COORDINATOR, ROUTER, AGENT = "leader", "coordinator", "router", "agent"
+BRIDGE = "bridge"
 SENDER_OF_GROUP = dict(zip(("vehicles", "coordinators", "bridge"), SENDERS, strict=True))
 """Groups that a partition may separate, with their sender names in message rules."""
 GROUPS = tuple(SENDER_OF_GROUP)
@@ -72,8 +73,8 @@ class RoleFault:
     """What happened to the target, as a past participle."""
 
     target: str = LEADER
-    """`leader`, `router`, `coordinator` (any), `agent` (any on the road), or the name of a
-    coordinator or a vehicle."""
+    """`leader`, `router`, `bridge` (kills only), `coordinator` (any), `agent` (any on the road), or
+    the name of a coordinator or a vehicle."""
     count: int = field(default=1, validator=within(1, 10_000))
     """Number of different targets; above 1 only for `agent` and `coordinator`."""
     at_s: float | None = field(default=None, validator=optional(within(0.0, MAX_S)))
@@ -122,6 +123,12 @@ class Kill(RoleFault):
         super().__attrs_post_init__()
         if self.restart_share < 1.0 and self.restart_after_s is None:
             raise BadInputError("restart_share", self.restart_share, "1 without restart_after_s")
+        if self.target == BRIDGE:
+            for name in ("restart_after_s", "every_s", "times"):
+                value = getattr(self, name)
+                if value is not None:
+                    allowed = f"none with target {BRIDGE}: another bridge drives another road"
+                    raise BadInputError(name, value, allowed)
 
 
 @frozen(kw_only=True)
@@ -132,6 +139,13 @@ class Pause(RoleFault):
 
     for_s: NumberOrRange = field(validator=_duration)
     """Wall-clock seconds, or a range from which they are drawn for each pause."""
+
+    def __attrs_post_init__(self) -> None:
+        """Check that the fields do not contradict each other."""
+        super().__attrs_post_init__()
+        if self.target == BRIDGE:
+            allowed = "any other target: a paused bridge stops the road and its clock"
+            raise BadInputError("target", BRIDGE, allowed)
 
 
 @frozen(kw_only=True)
@@ -180,6 +194,11 @@ class Partition(TimedFault):
             raise BadInputError("method", NAMESPACES, f"{MESSAGES}, or {OTHERS} in between")
 
     @property
+    def label(self) -> str:
+        """The two sides in words."""
+        return " and ".join(self.between)
+
+    @property
     def may_use_links(self) -> bool:
         """Whether taking a network link down can implement this partition."""
         return self.between[1] == OTHERS and self.method != MESSAGES
@@ -224,6 +243,11 @@ class LinkFault(TimedFault):
             raise BadInputError("burst", self.burst, "1 without loss")
         if self.burst > 1 and self.loss > MAX_BURST_LOSS:
             raise BadInputError("burst", self.burst, f"1 if loss is above {MAX_BURST_LOSS:g}")
+
+    @property
+    def label(self) -> str:
+        """Group whose link is affected."""
+        return self.of
 
     @property
     def delays(self) -> bool:
@@ -272,6 +296,12 @@ class FaultSpec:
         yield from self.partitions()
         for index, fault in enumerate(self.link):
             yield f"link[{index}]", fault
+
+    def windows(self) -> Iterator[tuple[str, MessageRule | Partition | LinkFault]]:
+        """Yield all faults that are in force for a period of road time, with their names."""
+        for index, rule in enumerate(self.messages):
+            yield f"messages[{index}]", rule
+        yield from self.timed_faults()
 
     def check_simulated(self) -> None:
         """Check that the simulated network supports these faults.
@@ -327,15 +357,35 @@ def _faults(
     tables: dict[str, Any], coordinators: Collection[str], vehicles: Collection[str] | None
 ) -> FaultSpec:
     specification = structure(tables, FaultSpec)
-    raise_all(_unknown_targets(specification, coordinators, vehicles))
+    raise_all(
+        (
+            *_unknown_processes(specification, coordinators, vehicles),
+            *_unknown_targets(specification, coordinators, vehicles),
+        )
+    )
     return specification
+
+
+def _unknown_processes(
+    specification: FaultSpec, coordinators: Collection[str], vehicles: Collection[str] | None
+) -> Iterator[BadInputError]:
+    """Yield an error for each process in a message rule that the run does not have."""
+    kinds = (*SENDERS, *coordinators)
+    for index, rule in enumerate(specification.messages):
+        fields = (("from", rule.sender), ("to", rule.receiver))
+        for name, process in (*fields, *(("between", one) for one in rule.between or ())):
+            if process in rule.names and not (
+                process in coordinators or vehicles is None or process in vehicles
+            ):
+                allowed = f"{', '.join(kinds)}, or the name of a vehicle of the run"
+                yield unknown_name(f"messages[{index}].{name}", process, kinds, allowed)
 
 
 def _unknown_targets(
     specification: FaultSpec, coordinators: Collection[str], vehicles: Collection[str] | None
 ) -> Iterator[BadInputError]:
     """Yield an error for each target that the run does not have."""
-    kinds = (LEADER, *coordinators, COORDINATOR, ROUTER, AGENT)
+    kinds = (LEADER, *coordinators, COORDINATOR, ROUTER, BRIDGE, AGENT)
     for name, fault in specification.role_faults():
         known = fault.target in kinds
         if not known and vehicles is not None and fault.target not in vehicles:

@@ -14,14 +14,7 @@ from operator import attrgetter
 
 from attrs import field, frozen
 
-from laneweave.launch.faults.fault_file import (
-    FaultSpec,
-    Kill,
-    Pause,
-    RoleFault,
-    TimedFault,
-)
-from laneweave.protocol.runtime.message_faults import MessageRule
+from laneweave.launch.faults.fault_file import FaultSpec, Kill, Pause, RoleFault
 
 
 @frozen
@@ -72,13 +65,9 @@ class FaultSchedule:
             for name, fault in self._specification.role_faults()
             if name not in applied
         ]
-        windows: list[tuple[str, MessageRule | TimedFault]] = [
-            *((f"messages[{i}]", rule) for i, rule in enumerate(self._specification.messages)),
-            *self._specification.timed_faults(),
-        ]
         lines += [
             f"the run ended before {name} came into force at {window.from_s:g} s"
-            for name, window in windows
+            for name, window in self._specification.windows()
             if window.from_s > self._reached_s
         ]
         return lines

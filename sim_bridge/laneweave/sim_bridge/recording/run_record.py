@@ -403,10 +403,14 @@ class RunRecord:
     # --- the end ------------------------------------------------------------------------------
 
     def close(self, t_s: float, ending: Ending) -> None:
-        """Write all files; only the first call has an effect."""
+        """Write all files; only the first call has an effect.
+
+        With the ending `UNFINISHED`, they are as if the process had been killed after `save`.
+        """
         if self._closed:
             return
-        self.event(t_s, RUN_ENDED, ending=ending.value)
+        if ending is not Ending.UNFINISHED:
+            self.event(t_s, RUN_ENDED, ending=ending.value)
         self._closed = True
         with self._disk.writing(), ExitStack() as closing:
             for file in (self._events, self._trajectories, self._trips, self._ticks):
