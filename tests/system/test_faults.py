@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import re
+import signal
 from pathlib import Path
 from typing import Any
 
 import psutil
 import pytest
 
+from support.deployments import ask, deployment, free_tcp, start_router, stop
 from support.harness import (
     DEMAND,
     END_S,
@@ -22,6 +24,7 @@ from support.harness import (
     plans,
     summary,
 )
+from support.service_lab import request
 from system.conftest import FinishedRun
 
 BLACKOUT_ROAD = """\
@@ -316,3 +319,60 @@ def test_links_lose_packets(lab: Lab, short: Path) -> None:
     found = summary(folder)
     assert injected(found, "link") == ["began", "ended"]
     assert found["messages"]["dropped_by_faults"] == 0
+
+
+@pytest.mark.more
+def test_faults_of_a_deployment_by_hand(lab: Lab) -> None:
+    """Only processes of the realm get signals; what is paused is resumed on Ctrl-C."""
+    config = deployment(lab, free_tcp())
+    other = lab.path("other.toml", config.read_text(encoding="utf-8").replace("test", "other"))
+    faults = lab.path(
+        "faults.toml",
+        '[[pause]]\ntarget = "c1"\nat_s = 5\nfor_s = 0.5\n'
+        '[[kill]]\ntarget = "c3"\nat_s = 6\n'
+        '[[kill]]\ntarget = "v0002"\nat_s = 8\n'
+        '[[pause]]\ntarget = "c2"\nat_s = 10\nfor_s = 500\n',
+    )
+    router = start_router(lab, config)
+    one, two = (lab.start("coordinator", "--config", config, "--name", c) for c in ("c1", "c2"))
+    stranger = lab.start("coordinator", "--config", other, "--name", "c3")
+    killed = lab.start("agent", "--config", config, "v0002")
+    rest = lab.start("agent", "--config", config, "--shard", "0/1")
+    lab.wait_until(lambda: ask(lab, config, request()).status == 0, END_S)
+    command = lab.start("faults", "apply", faults, "--config", config)
+    bridge = lab.start("bridge", "--config", config, "--pace", "3", "--out", "out")
+
+    lab.wait_until(lambda: _is_stopped(psutil.Process(two.pid)))
+    command.send_signal(signal.SIGINT)
+    ended = lab.finish(command, END_S)
+
+    assert ended.status == 1
+    assert ended.err.splitlines()[-1] == "interrupted"
+    assert "kill[0] waits for c3 on this host" in ended.err
+    assert not _is_stopped(psutil.Process(two.pid))
+    assert killed.wait(END_S) == -signal.SIGKILL
+    assert stranger.poll() is None
+    done = [line.split(": ", 1)[1] for line in ended.out.splitlines()]
+    assert done == [
+        f"pause[0]: c1 (process {one.pid}) paused",
+        *sorted(done[1:3], reverse=True),
+        f"pause[1]: c2 (process {two.pid}) paused",
+        f"pause[1]: c2 (process {two.pid}) resumed",
+    ]
+    assert set(done[1:3]) == {
+        f"pause[0]: c1 (process {one.pid}) resumed",
+        f"kill[1]: agent-v0002 (process {killed.pid}) killed",
+    }
+    lab.wait_until(lambda: len(events(lab.folder / "out", "fault-injected")) == len(done), END_S)
+    bridge.send_signal(signal.SIGTERM)
+    assert lab.finish(bridge, END_S).status == 0
+    stop(lab, rest, one, two, stranger, router)
+    lab.check_nothing_left()
+
+
+def test_faults_that_are_not_possible_from_outside(lab: Lab) -> None:
+    faults = lab.path("faults.toml", '[[messages]]\nfrom = "c1"\nto = "v0003"\nloss = 1\n')
+    ended = lab.run_forked("faults", "apply", faults, "--endpoint", free_tcp())
+    assert ended.status == 2
+    (line,) = ended.err.splitlines()
+    assert line.startswith("messages: got a table; allowed: nothing from outside: ")

@@ -18,7 +18,13 @@ from attrs import field, frozen
 from attrs.validators import optional
 
 from laneweave.protocol.config.source_files import SourceFile, read_toml_source
-from laneweave.protocol.errors import NO_VALUE, BadInputError, raise_all, unknown_name
+from laneweave.protocol.errors import (
+    NO_VALUE,
+    BadInputError,
+    Described,
+    raise_all,
+    unknown_name,
+)
 from laneweave.protocol.field_validators import one_of, within
 from laneweave.protocol.runtime.message_faults import SENDERS, MessageRule
 from laneweave.protocol.structuring import NumberOrRange, structure
@@ -322,6 +328,32 @@ class FaultSpec:
             )
             raise BadInputError("link", "a table", allowed)
 
+    def check_outside(self) -> None:
+        """Check that these faults can be applied to a deployment from outside its processes.
+
+        Raises:
+            BadInputError: some cannot.
+        """
+        raise_all(self._impossible_outside())
+
+    def _impossible_outside(self) -> Iterator[BadInputError]:
+        where = "from outside"
+        for name, faults, why in (
+            ("messages", self.messages, "only a process itself can lose or delay messages"),
+            ("partition", self.partition, "only processes themselves can lose messages"),
+            ("link", self.link, "only links that `laneweave run` has made lose packets"),
+        ):
+            if faults:
+                allowed = f"nothing {where}: {why} (laneweave run --faults)"
+                yield BadInputError(name, Described("a table"), allowed)
+        for name, fault in self.role_faults():
+            if fault.target == ROUTER:
+                allowed = f"any other target {where}: a router has no token by which to find it"
+                yield BadInputError(f"{name}.target", ROUTER, allowed)
+            if isinstance(fault, Kill) and fault.restart_after_s is not None:
+                allowed = f"nothing {where}: start the process again as it was started"
+                yield BadInputError(f"{name}.restart_after_s", fault.restart_after_s, allowed)
+
 
 def preset_names() -> tuple[str, ...]:
     """Return the names of the presets in alphabetical order."""
@@ -332,6 +364,8 @@ def load_faults(
     choice: FaultSource,
     coordinators: Collection[str],
     vehicles: Collection[str] | None = None,
+    *,
+    name: str = "--faults",
 ) -> FaultSpec:
     """Return the faults of a file, a preset or tables.
 
@@ -340,6 +374,7 @@ def load_faults(
             mappings and sequences, as in a file; None: no faults.
         coordinators: names of the run's coordinators.
         vehicles: names of the run's vehicles; None: accept any vehicle name.
+        name: option or argument with the choice, for errors.
 
     Raises:
         BadInputError: the file or preset does not exist, or a value is not allowed.
@@ -348,7 +383,7 @@ def load_faults(
         return FaultSpec()
     if isinstance(choice, Mapping):
         return _faults(dict(choice), coordinators, vehicles)
-    source = _source(choice)
+    source = _source(choice, name)
     with source.located():
         return _faults(source.tables, coordinators, vehicles)
 
@@ -393,18 +428,18 @@ def _unknown_targets(
             yield unknown_name(f"{name}.target", fault.target, kinds, allowed)
 
 
-def _source(choice: Path | str) -> SourceFile:
+def _source(choice: Path | str, name: str) -> SourceFile:
     path = Path(choice)
     names = preset_names()
     try:
         exists = path.exists()
     except OSError as error:
-        raise BadInputError("--faults", str(choice), f"a file ({error.strerror})") from error
+        raise BadInputError(name, str(choice), f"a file ({error.strerror})") from error
     if exists:
         return read_toml_source(path)
     if str(choice) not in names:
         allowed = f"a readable file, or one of {', '.join(names)}"
-        raise unknown_name("--faults", str(choice), names, allowed)
+        raise unknown_name(name, str(choice), names, allowed)
     with as_file(_presets().joinpath(f"{choice}.toml")) as preset:
         return read_toml_source(preset)
 

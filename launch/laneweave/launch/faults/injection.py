@@ -106,7 +106,7 @@ class FaultInjection:
     schedule: FaultSchedule = field(init=False)
     _starts: dict[str, int] = field(factory=dict)
     """Number of times that each role was started."""
-    _waiting: list[FaultEvent] = field(factory=list)
+    waiting: list[FaultEvent] = field(factory=list)
     """Due events that wait for a target."""
     _recoveries: list[Recovery] = field(factory=list)
     """Pending resumes and restarts."""
@@ -169,15 +169,33 @@ class FaultInjection:
         self._road_s, self._run_s = road_s, now_s - self._first_step_s
         self._recover(now_s)
         self.failover.update(view, now_s)
-        self._waiting += self.schedule.due(road_s)
-        waiting, self._waiting = self._waiting, []
+        self.waiting += self.schedule.due(road_s)
+        waiting, self.waiting = self.waiting, []
         for event in waiting:
             name = self._choose(event, view)
             if name is None:
-                self._waiting.append(event)
+                self.waiting.append(event)
             else:
                 self._apply(event, name, now_s, view)
         self._begin_and_end_windows(road_s)
+
+    def skip(self, road_s: float) -> None:
+        """Drop the kills and pauses that were due before a road time; call it before `step`."""
+        self.schedule.skip(road_s)
+
+    def resume_paused(self) -> None:
+        """Resume all paused roles now; call it if `step` is not called any more."""
+        paused = [one for one in self._recoveries if not one.restarts]
+        self._recoveries = []
+        for recovery in paused:
+            self.roles.resume(recovery.role)
+        for recovery in paused:
+            self._report(recovery.fault_name, "resumed", recovery.role)
+
+    @property
+    def finished(self) -> bool:
+        """Whether all kills and pauses have been applied, and undone where they are undone."""
+        return not self.waiting and not self._recoveries and self.schedule.is_empty
 
     def unused_faults(self) -> list[str]:
         """Return a line for each fault that had no effect."""

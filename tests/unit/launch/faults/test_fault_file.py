@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -282,6 +283,29 @@ def test_a_partition_has_a_window() -> None:
 def test_a_simulated_network_loses_no_packets() -> None:
     with pytest.raises(BadInputError, match=r"link: .*no packets"):
         FaultSpec(link=(LinkFault(loss=0.1),)).check_simulated()
+
+
+@for_each(
+    ("faults", "field"),
+    [
+        ({"messages": [{"loss": 1.0}]}, "messages"),
+        ({"partition": [{"between": ["bridge", "others"]}]}, "partition"),
+        ({"link": [{"loss": 0.1}]}, "link"),
+        ({"kill": [{"target": "router", "at_s": 1}]}, "kill[0].target"),
+        ({"kill": [{"at_s": 1, "restart_after_s": 1}]}, "kill[0].restart_after_s"),
+        ({"pause": [{"target": "router", "at_s": 1, "for_s": 1}]}, "pause[0].target"),
+    ],
+)
+def test_what_is_not_possible_from_outside_is_refused(faults: dict[str, Any], field: str) -> None:
+    with pytest.raises(BadInputError, match="from outside") as caught:
+        load_faults(faults, COORDINATORS).check_outside()
+    assert caught.value.field == field
+
+
+def test_kills_and_pauses_are_possible_from_outside() -> None:
+    kills = [{"target": name, "at_s": 1} for name in ("leader", "c1", "v0001", "agent", "bridge")]
+    faults = {"kill": kills, "pause": [{"at_s": 1, "for_s": 2}]}
+    load_faults(faults, COORDINATORS).check_outside()
 
 
 # --- presets --------------------------------------------------------------------------------------
