@@ -20,9 +20,7 @@ def _group() -> None:
 
 @faults.command()
 def apply(
-    file: Annotated[
-        str, typer.Argument(metavar="FILE", help="Faults as for `laneweave run --faults`.")
-    ],
+    file: Annotated[str, typer.Argument(metavar="FILE", help="Fault file: docs/FAULTS.md.")],
     config: Config = None,
     endpoint: Endpoint = None,
     realm: Annotated[str | None, typer.Option("--realm", help="Realm of the processes.")] = None,

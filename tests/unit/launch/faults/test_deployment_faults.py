@@ -22,6 +22,7 @@ from laneweave.launch.observe.process_view import ProcessToken
 from laneweave.launch.observe.road_view import RoadView
 from laneweave.protocol.wire import identities
 from laneweave.protocol.wire.messages import Census, CensusEntry, Name
+from support.waiting import wait_until
 
 REALM = "r1"
 SLEEP = "import time\nprint(flush=True)\ntime.sleep(600)\n"
@@ -136,8 +137,10 @@ def test_a_process_of_another_host_or_time_or_user_gets_no_signal(
     assert reason(token).startswith("is not")
 
 
-def is_stopped(process: subprocess.Popen[str]) -> bool:
-    return bool(psutil.Process(process.pid).status() == psutil.STATUS_STOPPED)
+def await_stopped(process: subprocess.Popen[str], *, stopped: bool) -> None:
+    """Wait until a process is suspended, or no longer; a signal takes effect soon."""
+    one = psutil.Process(process.pid)
+    wait_until(lambda: (one.status() == psutil.STATUS_STOPPED) is stopped, 10.0)
 
 
 def test_faults_affect_processes_by_name_and_vehicle(start: Start) -> None:
@@ -163,7 +166,7 @@ def test_faults_affect_processes_by_name_and_vehicle(start: Start) -> None:
     )
     view.census = Census(0.0, (CensusEntry(Name("v1"), (0, 0), 0, 0.0),), ())
     faults.step(5.0, 0.0, view)
-    assert is_stopped(one)
+    await_stopped(one, stopped=True)
     assert set(roles.running) == {"c1", "fleet-0-of-1"}
     assert [event.fault_name for event in faults.waiting] == ["kill[0]"]
     assert roles.elsewhere == {
@@ -177,7 +180,7 @@ def test_faults_affect_processes_by_name_and_vehicle(start: Start) -> None:
     assert set(roles.running) == {"c1"}
     assert not faults.finished
     faults.resume_paused()
-    assert not is_stopped(one)
+    await_stopped(one, stopped=False)
     assert stranger.poll() is None
 
 
