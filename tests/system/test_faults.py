@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import re
+import signal
 from pathlib import Path
 from typing import Any
 
 import psutil
 import pytest
 
+from support.deployments import ask, deployment, free_tcp, start_router, stop
 from support.harness import (
     DEMAND,
     END_S,
@@ -21,6 +24,7 @@ from support.harness import (
     plans,
     summary,
 )
+from support.service_lab import request
 from system.conftest import FinishedRun
 
 BLACKOUT_ROAD = """\
@@ -211,6 +215,58 @@ def test_each_group_is_cut_off_for_some_time(lab: Lab, short: Path) -> None:
 
 
 @pytest.mark.more
+def test_rules_between_single_processes(lab: Lab, short: Path) -> None:
+    """The agent that hears nothing of the road is the only one that a caretaker replaces."""
+    faults = lab.path(
+        "faults.toml",
+        '[[messages]]\nfrom = "bridge"\nto = "v0003"\nloss = 1\nuntil_s = 20\n'
+        '[[messages]]\nbetween = ["v0001", "v0002"]\nloss = 1\n'
+        '[[messages]]\nfrom = "c1"\nto = "v0005"\nloss = 1\n'
+        '[[pause]]\ntarget = "c2"\nat_s = 9\nfor_s = 0.5\n'
+        '[[kill]]\ntarget = "v0004"\nat_s = 9\nrestart_after_s = 0.2\n',
+    )
+
+    found = run_with(lab, short, faults, "--pace", "5", "--duration", "10")
+
+    folder = lab.folder / "out"
+    assert found["messages"]["dropped_by_faults"] > 0
+    silent = {event["vehicle"] for event in events(folder, "agent-silent")}
+    assert silent == {"v0003"}
+    injected = events(folder, "fault-injected")
+    assert {(one["fault"], one["action"], one["target"]) for one in injected} == {
+        ("messages[0]", "began", "bridge to v0003"),
+        ("messages[0]", "ended", "bridge to v0003"),
+        ("messages[1]", "began", "v0001 and v0002"),
+        ("messages[2]", "began", "c1 to v0005"),
+        ("pause[0]", "paused", "c2"),
+        ("pause[0]", "resumed", "c2"),
+        ("kill[0]", "killed", "agent-v0004"),
+        ("kill[0]", "restarted", "agent-v0004"),
+    }
+    assert [one["run_s"] for one in injected] == sorted(one["run_s"] for one in injected)
+
+
+@pytest.mark.more
+def test_a_run_ends_with_its_killed_bridge(lab: Lab, short: Path) -> None:
+    faults = lab.path("faults.toml", '[[kill]]\ntarget = "bridge"\nat_s = 12\n')
+    folder = lab.folder / "out"
+
+    ended = lab.run(
+        *("run", short, *DEMAND, "--pace", "3", "--vehicles-per-process", "8"),
+        *("--faults", faults, "--out", folder),
+    )
+
+    assert ended.status == 1
+    (line,) = [line for line in ended.out.splitlines() if line.startswith("FAILED: ")]
+    assert re.fullmatch(r"FAILED: the bridge was killed at 12\.\d s by kill\[0\]", line)
+    assert summary(folder)["ending"] == "unfinished"
+    (event,) = events(folder, "fault-injected")
+    assert (event["action"], event["target"]) == ("killed", "bridge")
+    assert lab.run("repair", folder).status == 0
+    lab.check_nothing_left()
+
+
+@pytest.mark.more
 def test_a_fault_that_never_came_fails_the_run(lab: Lab, short: Path) -> None:
     faults = lab.path(
         "faults.toml", "[[kill]]\nat_s = 5000\n[[messages]]\nloss = 1\nfrom_s = 6000\n"
@@ -263,3 +319,60 @@ def test_links_lose_packets(lab: Lab, short: Path) -> None:
     found = summary(folder)
     assert injected(found, "link") == ["began", "ended"]
     assert found["messages"]["dropped_by_faults"] == 0
+
+
+@pytest.mark.more
+def test_faults_of_a_deployment_by_hand(lab: Lab) -> None:
+    """Only processes of the realm get signals; what is paused is resumed on Ctrl-C."""
+    config = deployment(lab, free_tcp())
+    other = lab.path("other.toml", config.read_text(encoding="utf-8").replace("test", "other"))
+    faults = lab.path(
+        "faults.toml",
+        '[[pause]]\ntarget = "c1"\nat_s = 5\nfor_s = 0.5\n'
+        '[[kill]]\ntarget = "c3"\nat_s = 6\n'
+        '[[kill]]\ntarget = "v0002"\nat_s = 8\n'
+        '[[pause]]\ntarget = "c2"\nat_s = 10\nfor_s = 500\n',
+    )
+    router = start_router(lab, config)
+    one, two = (lab.start("coordinator", "--config", config, "--name", c) for c in ("c1", "c2"))
+    stranger = lab.start("coordinator", "--config", other, "--name", "c3")
+    killed = lab.start("agent", "--config", config, "v0002")
+    rest = lab.start("agent", "--config", config, "--shard", "0/1")
+    lab.wait_until(lambda: ask(lab, config, request()).status == 0, END_S)
+    command = lab.start("faults", "apply", faults, "--config", config)
+    bridge = lab.start("bridge", "--config", config, "--pace", "3", "--out", "out")
+
+    lab.wait_until(lambda: _is_stopped(psutil.Process(two.pid)))
+    command.send_signal(signal.SIGINT)
+    ended = lab.finish(command, END_S)
+
+    assert ended.status == 1
+    assert ended.err.splitlines()[-1] == "interrupted"
+    assert "kill[0] waits for c3 on this host" in ended.err
+    assert not _is_stopped(psutil.Process(two.pid))
+    assert killed.wait(END_S) == -signal.SIGKILL
+    assert stranger.poll() is None
+    done = [line.split(": ", 1)[1] for line in ended.out.splitlines()]
+    assert done == [
+        f"pause[0]: c1 (process {one.pid}) paused",
+        *sorted(done[1:3], reverse=True),
+        f"pause[1]: c2 (process {two.pid}) paused",
+        f"pause[1]: c2 (process {two.pid}) resumed",
+    ]
+    assert set(done[1:3]) == {
+        f"pause[0]: c1 (process {one.pid}) resumed",
+        f"kill[1]: agent-v0002 (process {killed.pid}) killed",
+    }
+    lab.wait_until(lambda: len(events(lab.folder / "out", "fault-injected")) == len(done), END_S)
+    bridge.send_signal(signal.SIGTERM)
+    assert lab.finish(bridge, END_S).status == 0
+    stop(lab, rest, one, two, stranger, router)
+    lab.check_nothing_left()
+
+
+def test_faults_that_are_not_possible_from_outside(lab: Lab) -> None:
+    faults = lab.path("faults.toml", '[[messages]]\nfrom = "c1"\nto = "v0003"\nloss = 1\n')
+    ended = lab.run_forked("faults", "apply", faults, "--endpoint", free_tcp())
+    assert ended.status == 2
+    (line,) = ended.err.splitlines()
+    assert line.startswith("messages: got a table; allowed: nothing from outside: ")

@@ -38,6 +38,7 @@ from laneweave.protocol.config.scenario_files import load_scenario, parse_scenar
 from laneweave.protocol.lattice import Cell, footprint
 from laneweave.protocol.runtime.message_faults import MessageRule
 from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.structuring import key_in_files
 from laneweave.protocol.summary import Ending
 from laneweave.protocol.vehicle.motion import cell_state
 from laneweave.protocol.wire.codec import KINDS
@@ -142,7 +143,7 @@ def test_rules_between_fields_name_existing_fields() -> None:
 )
 def test_tables_of_faults(heading: str, kind: type) -> None:
     shown = {code(cells[0]): cells[1:] for cells in rows(section(read("FAULTS.md"), heading))}
-    fields = attrs.fields_dict(kind)
+    fields = {key_in_files(field): field for field in attrs.fields(kind)}
     assert shown.keys() == fields.keys()
     for name, (default, allowed, meaning) in shown.items():
         limits = limits_of(fields[name])

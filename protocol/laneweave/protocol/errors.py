@@ -106,6 +106,10 @@ class BadInputError(ValueError):
         """Return the same error with its place in a file, unless it has one."""
         return self._with(place=self.place or place)
 
+    def of(self, field: str) -> BadInputError:
+        """Return the same error with another name of the field."""
+        return self._with(field=field)
+
     def suggesting(self, suggestion: str) -> BadInputError:
         """Return the same error of an unknown key with another suggestion."""
         return self._with(choices=(suggestion,))

@@ -31,6 +31,22 @@ def write_atomically(path: Path, write: str | Callable[[Path], object]) -> None:
         raise
 
 
+def append(file: io.FileIO, data: bytes) -> None:
+    """Append to a file to which other processes may append; after an error, nothing is added.
+
+    Args:
+        file: opened unbuffered, for appending.
+        data: the new content, which readers see as a whole.
+
+    Raises:
+        OSError: the disk is full, or fails.
+    """
+    written_bytes = file.write(data)
+    if written_bytes < len(data):
+        file.truncate(file.tell() - written_bytes)
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
 def overwrite(file: io.FileIO, begin: int, data: bytes) -> None:
     """Replace the content of a file from a position on; after an error, the file is as before.
 

@@ -43,6 +43,14 @@ NumberOrRange = float | tuple[float, float]
 """A number, or the range from which it is drawn."""
 TextOrTexts = str | tuple[str, ...]
 """One text or several."""
+KEY = "key"
+"""Key of a field's metadata: name of the field in files, where it differs. Python reserves `from`.
+Files may also use the name of the field in Python."""
+
+
+def key_in_files(attribute: attrs.Attribute[Any]) -> str:
+    """Return the name of a field in files."""
+    return str(attribute.metadata.get(KEY, attribute.alias))
 
 
 def _exactly(kind: type, name: str) -> Hook:
@@ -171,6 +179,9 @@ def _dict_hook(kind: Any, converter: Converter) -> Hook:  # noqa: ANN401 (a gene
 
 def _class_hook(kind: type, converter: Converter) -> Hook:
     fields_hook: Hook = make_dict_structure_fn(kind, converter, _cattrs_forbid_extra_keys=True)
+    names: dict[str, str] = {
+        one.metadata[KEY]: one.alias for one in attrs.fields(kind) if KEY in one.metadata
+    }
 
     def hook(value: object, _: type) -> object:
         if not isinstance(value, Mapping):
@@ -178,13 +189,26 @@ def _class_hook(kind: type, converter: Converter) -> Hook:
         for key in value:
             if type(key) is not str:
                 raise BadInputError("", key, "a text as the key of each field")
+        for key, name in names.items():
+            if key in value and name in value:
+                raise BadInputError(name, value[name], f"nothing if {key} is given")
+        given: dict[str, str] = {names.get(key) or key: key for key in value}
+        fields = {name: value[key] for name, key in given.items()}
         try:
-            return fields_hook(value, kind)
+            return fields_hook(fields, kind)
         except Exception as error:  # noqa: BLE001 (hooks and validators may raise anything)
-            problems = [*problems_of(error), *_invalid_values(value, kind, converter)]
-        raise combined(problems)
+            problems = [*problems_of(error), *_invalid_values(fields, kind, converter)]
+        raise combined(_as_given(one, given) for one in problems)
 
     return hook
+
+
+def _as_given(error: BadInputError, given: Mapping[str, str]) -> BadInputError:
+    """Return an error whose field has the name that the file gives it."""
+    name = re.match(r"[^.\[\]]*", error.field)
+    if name is None or given.get(name[0], name[0]) == name[0]:
+        return error
+    return error.of(given[name[0]] + error.field[name.end() :])
 
 
 _CONVERTER = _strict_converter()
@@ -283,7 +307,7 @@ def problems_of(error: Exception, path: str = "") -> list[BadInputError]:
             for problem in problems_of(inner, path + _step(inner, bool(path)))
         ]
     if isinstance(error, ForbiddenExtraKeysError):
-        known = tuple(sorted(attribute.alias for attribute in attrs.fields(error.cl)))
+        known = tuple(sorted(key_in_files(attribute) for attribute in attrs.fields(error.cl)))
         return [
             unknown_name(name or repr(name), UNKNOWN_KEY, known).within(path)
             for name in sorted(error.extra_fields)[:MAX_PROBLEMS]

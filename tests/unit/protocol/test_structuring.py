@@ -10,7 +10,7 @@ from attrs import field, frozen
 
 from laneweave.protocol.errors import MAX_PROBLEMS, BadInputError
 from laneweave.protocol.field_validators import within
-from laneweave.protocol.structuring import NumberOrRange, structure, without
+from laneweave.protocol.structuring import KEY, NumberOrRange, structure, without
 from support.refusals import refusal
 from support.tables import for_each
 
@@ -178,6 +178,30 @@ def test_a_key_of_another_table_is_suggested() -> None:
     assert refusal(structure, {"count": 1, "part": {"size": 1, "maybe": 2}}, Whole).suggestion == (
         "maybe"
     )
+
+
+@frozen
+class Route:
+    """A field whose name Python reserves."""
+
+    source: str = field(default="all", metadata={KEY: "from"})
+
+
+def test_a_field_may_have_another_name_in_files() -> None:
+    assert structure({"from": "a"}, Route) == structure({"source": "a"}, Route) == Route("a")
+
+
+@pytest.mark.parametrize(
+    ("data", "line"),
+    [
+        ({"from": 1}, "from: got 1; "),
+        ({"source": 1}, "source: got 1; "),
+        ({"from": "a", "source": "a"}, "source: got 'a'; allowed: nothing if from is given"),
+        ({"form": "a"}, "form: got an unknown key; allowed: one of from; did you mean from?"),
+    ],
+)
+def test_errors_have_the_name_that_is_in_the_file(data: dict[str, Any], line: str) -> None:
+    assert str(refusal(structure, data, Route)).startswith(line)
 
 
 def test_without_removes_fields() -> None:

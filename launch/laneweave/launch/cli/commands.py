@@ -68,6 +68,7 @@ COMMANDS = {
         "status",
         "Listen to a deployment and print its state; exit with status 1 if it is unhealthy.",
     ),
+    "faults": CommandEntry("faults_command", "faults", "Inject faults into a deployment."),
     "sweep": CommandEntry(
         "study_commands",
         "sweep",

@@ -18,12 +18,19 @@ from attrs import field, frozen
 from attrs.validators import optional
 
 from laneweave.protocol.config.source_files import SourceFile, read_toml_source
-from laneweave.protocol.errors import NO_VALUE, BadInputError, raise_all, unknown_name
+from laneweave.protocol.errors import (
+    NO_VALUE,
+    BadInputError,
+    Described,
+    raise_all,
+    unknown_name,
+)
 from laneweave.protocol.field_validators import one_of, within
 from laneweave.protocol.runtime.message_faults import SENDERS, MessageRule
 from laneweave.protocol.structuring import NumberOrRange, structure
 
 LEADER, COORDINATOR, ROUTER, AGENT = "leader", "coordinator", "router", "agent"
+BRIDGE = "bridge"
 SENDER_OF_GROUP = dict(zip(("vehicles", "coordinators", "bridge"), SENDERS, strict=True))
 """Groups that a partition may separate, with their sender names in message rules."""
 GROUPS = tuple(SENDER_OF_GROUP)
@@ -72,8 +79,8 @@ class RoleFault:
     """What happened to the target, as a past participle."""
 
     target: str = LEADER
-    """`leader`, `router`, `coordinator` (any), `agent` (any on the road), or the name of a
-    coordinator or a vehicle."""
+    """`leader`, `router`, `bridge` (kills only), `coordinator` (any), `agent` (any on the road), or
+    the name of a coordinator or a vehicle."""
     count: int = field(default=1, validator=within(1, 10_000))
     """Number of different targets; above 1 only for `agent` and `coordinator`."""
     at_s: float | None = field(default=None, validator=optional(within(0.0, MAX_S)))
@@ -122,6 +129,12 @@ class Kill(RoleFault):
         super().__attrs_post_init__()
         if self.restart_share < 1.0 and self.restart_after_s is None:
             raise BadInputError("restart_share", self.restart_share, "1 without restart_after_s")
+        if self.target == BRIDGE:
+            for name in ("restart_after_s", "every_s", "times"):
+                value = getattr(self, name)
+                if value is not None:
+                    allowed = f"none with target {BRIDGE}: another bridge drives another road"
+                    raise BadInputError(name, value, allowed)
 
 
 @frozen(kw_only=True)
@@ -132,6 +145,13 @@ class Pause(RoleFault):
 
     for_s: NumberOrRange = field(validator=_duration)
     """Wall-clock seconds, or a range from which they are drawn for each pause."""
+
+    def __attrs_post_init__(self) -> None:
+        """Check that the fields do not contradict each other."""
+        super().__attrs_post_init__()
+        if self.target == BRIDGE:
+            allowed = "any other target: a paused bridge stops the road and its clock"
+            raise BadInputError("target", BRIDGE, allowed)
 
 
 @frozen(kw_only=True)
@@ -180,6 +200,11 @@ class Partition(TimedFault):
             raise BadInputError("method", NAMESPACES, f"{MESSAGES}, or {OTHERS} in between")
 
     @property
+    def label(self) -> str:
+        """The two sides in words."""
+        return " and ".join(self.between)
+
+    @property
     def may_use_links(self) -> bool:
         """Whether taking a network link down can implement this partition."""
         return self.between[1] == OTHERS and self.method != MESSAGES
@@ -224,6 +249,11 @@ class LinkFault(TimedFault):
             raise BadInputError("burst", self.burst, "1 without loss")
         if self.burst > 1 and self.loss > MAX_BURST_LOSS:
             raise BadInputError("burst", self.burst, f"1 if loss is above {MAX_BURST_LOSS:g}")
+
+    @property
+    def label(self) -> str:
+        """Group whose link is affected."""
+        return self.of
 
     @property
     def delays(self) -> bool:
@@ -273,6 +303,12 @@ class FaultSpec:
         for index, fault in enumerate(self.link):
             yield f"link[{index}]", fault
 
+    def windows(self) -> Iterator[tuple[str, MessageRule | Partition | LinkFault]]:
+        """Yield all faults that are in force for a period of road time, with their names."""
+        for index, rule in enumerate(self.messages):
+            yield f"messages[{index}]", rule
+        yield from self.timed_faults()
+
     def check_simulated(self) -> None:
         """Check that the simulated network supports these faults.
 
@@ -292,6 +328,32 @@ class FaultSpec:
             )
             raise BadInputError("link", "a table", allowed)
 
+    def check_outside(self) -> None:
+        """Check that these faults can be applied to a deployment from outside its processes.
+
+        Raises:
+            BadInputError: some cannot.
+        """
+        raise_all(self._impossible_outside())
+
+    def _impossible_outside(self) -> Iterator[BadInputError]:
+        where = "from outside"
+        for name, faults, why in (
+            ("messages", self.messages, "only a process itself can lose or delay messages"),
+            ("partition", self.partition, "only processes themselves can lose messages"),
+            ("link", self.link, "only links that `laneweave run` has made lose packets"),
+        ):
+            if faults:
+                allowed = f"nothing {where}: {why} (laneweave run --faults)"
+                yield BadInputError(name, Described("a table"), allowed)
+        for name, fault in self.role_faults():
+            if fault.target == ROUTER:
+                allowed = f"any other target {where}: a router has no token by which to find it"
+                yield BadInputError(f"{name}.target", ROUTER, allowed)
+            if isinstance(fault, Kill) and fault.restart_after_s is not None:
+                allowed = f"nothing {where}: start the process again as it was started"
+                yield BadInputError(f"{name}.restart_after_s", fault.restart_after_s, allowed)
+
 
 def preset_names() -> tuple[str, ...]:
     """Return the names of the presets in alphabetical order."""
@@ -302,6 +364,8 @@ def load_faults(
     choice: FaultSource,
     coordinators: Collection[str],
     vehicles: Collection[str] | None = None,
+    *,
+    name: str = "--faults",
 ) -> FaultSpec:
     """Return the faults of a file, a preset or tables.
 
@@ -310,6 +374,7 @@ def load_faults(
             mappings and sequences, as in a file; None: no faults.
         coordinators: names of the run's coordinators.
         vehicles: names of the run's vehicles; None: accept any vehicle name.
+        name: option or argument with the choice, for errors.
 
     Raises:
         BadInputError: the file or preset does not exist, or a value is not allowed.
@@ -318,7 +383,7 @@ def load_faults(
         return FaultSpec()
     if isinstance(choice, Mapping):
         return _faults(dict(choice), coordinators, vehicles)
-    source = _source(choice)
+    source = _source(choice, name)
     with source.located():
         return _faults(source.tables, coordinators, vehicles)
 
@@ -327,15 +392,35 @@ def _faults(
     tables: dict[str, Any], coordinators: Collection[str], vehicles: Collection[str] | None
 ) -> FaultSpec:
     specification = structure(tables, FaultSpec)
-    raise_all(_unknown_targets(specification, coordinators, vehicles))
+    raise_all(
+        (
+            *_unknown_processes(specification, coordinators, vehicles),
+            *_unknown_targets(specification, coordinators, vehicles),
+        )
+    )
     return specification
+
+
+def _unknown_processes(
+    specification: FaultSpec, coordinators: Collection[str], vehicles: Collection[str] | None
+) -> Iterator[BadInputError]:
+    """Yield an error for each process in a message rule that the run does not have."""
+    kinds = (*SENDERS, *coordinators)
+    for index, rule in enumerate(specification.messages):
+        fields = (("from", rule.sender), ("to", rule.receiver))
+        for name, process in (*fields, *(("between", one) for one in rule.between or ())):
+            if process in rule.names and not (
+                process in coordinators or vehicles is None or process in vehicles
+            ):
+                allowed = f"{', '.join(kinds)}, or the name of a vehicle of the run"
+                yield unknown_name(f"messages[{index}].{name}", process, kinds, allowed)
 
 
 def _unknown_targets(
     specification: FaultSpec, coordinators: Collection[str], vehicles: Collection[str] | None
 ) -> Iterator[BadInputError]:
     """Yield an error for each target that the run does not have."""
-    kinds = (LEADER, *coordinators, COORDINATOR, ROUTER, AGENT)
+    kinds = (LEADER, *coordinators, COORDINATOR, ROUTER, BRIDGE, AGENT)
     for name, fault in specification.role_faults():
         known = fault.target in kinds
         if not known and vehicles is not None and fault.target not in vehicles:
@@ -343,18 +428,18 @@ def _unknown_targets(
             yield unknown_name(f"{name}.target", fault.target, kinds, allowed)
 
 
-def _source(choice: Path | str) -> SourceFile:
+def _source(choice: Path | str, name: str) -> SourceFile:
     path = Path(choice)
     names = preset_names()
     try:
         exists = path.exists()
     except OSError as error:
-        raise BadInputError("--faults", str(choice), f"a file ({error.strerror})") from error
+        raise BadInputError(name, str(choice), f"a file ({error.strerror})") from error
     if exists:
         return read_toml_source(path)
     if str(choice) not in names:
         allowed = f"a readable file, or one of {', '.join(names)}"
-        raise unknown_name("--faults", str(choice), names, allowed)
+        raise unknown_name(name, str(choice), names, allowed)
     with as_file(_presets().joinpath(f"{choice}.toml")) as preset:
         return read_toml_source(preset)
 

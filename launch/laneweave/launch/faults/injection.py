@@ -7,15 +7,16 @@ may implement partitions instead, and implement faults of links.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from typing import Any, Protocol
 
 import structlog
-from attrs import define, field
+from attrs import define, field, frozen
 
 from laneweave.launch.faults.failover import Failover
 from laneweave.launch.faults.fault_file import (
     AGENT,
+    BRIDGE,
     COORDINATOR,
     LEADER,
     MESSAGES,
@@ -34,6 +35,10 @@ from laneweave.launch.observe.road_view import RoadView
 from laneweave.protocol.errors import CommandFailedError
 from laneweave.protocol.runtime.message_faults import MessageRule
 
+LAUNCHER = "launcher"
+"""Role of the process that injects faults, in its events."""
+LogEvent = Callable[[float, Mapping[str, object]], None]
+"""Writes an event `fault-injected` with this road time [s] and data."""
 log = structlog.get_logger(__name__)
 
 
@@ -64,6 +69,21 @@ class RoleControl(Protocol):
         """Restart a killed role with empty memory."""
 
 
+@frozen
+class Recovery:
+    """The end of a pause, or the restart after a kill."""
+
+    due_s: float
+    """Time on the clock of `FaultInjection.step`."""
+    fault_name: str
+    role: str
+    restarts: bool
+
+
+def _log_nowhere(_: float, __: Mapping[str, object]) -> None:
+    pass
+
+
 @define
 class FaultInjection:
     """Fault engine of a run."""
@@ -77,31 +97,45 @@ class FaultInjection:
     """Namespaces for partitions; None: partitions drop messages."""
     no_network_reason: str = ""
     """Why there are no namespaces."""
+    log_event: LogEvent = _log_nowhere
     injected: list[dict[str, Any]] = field(factory=list)
     """Applied faults: road time, name of the fault, and the effect with its target."""
+    end: str = ""
+    """Why the faults have ended the run; empty: they have not."""
     failover: Failover = field(init=False)
     schedule: FaultSchedule = field(init=False)
     _starts: dict[str, int] = field(factory=dict)
     """Number of times that each role was started."""
-    _waiting: list[FaultEvent] = field(factory=list)
+    waiting: list[FaultEvent] = field(factory=list)
     """Due events that wait for a target."""
-    _recoveries: list[tuple[float, str, Callable[[str], None]]] = field(factory=list)
-    """Pending resumes and restarts: time on the clock of `now_s`, role, and action."""
+    _recoveries: list[Recovery] = field(factory=list)
+    """Pending resumes and restarts."""
     _targets: dict[str, set[str]] = field(factory=dict)
     """Targets of each fault; a fault affects each agent at most once."""
     _paused: set[str] = field(factory=set)
-    _in_force: set[str] = field(factory=set)
-    """Names of the partitions and the faults of links in force."""
+    _began: set[str] = field(factory=set)
+    """Names of the rules, partitions and faults of links that have begun."""
+    _ended: set[str] = field(factory=set)
+    """Those that have ended."""
+    _unmet: dict[str, MessageRule] = field(init=False)
+    """Rules whose single processes have not all run while the rule was in force."""
+    _first_step_s: float | None = None
+    _road_s: float = 0.0
+    """Road time of the current step."""
+    _run_s: float = 0.0
+    """Time of the current step since the first one."""
 
     def __attrs_post_init__(self) -> None:
         """Draw the schedule of the faults."""
+        rules = enumerate(self.specification.messages)
+        self._unmet = {f"messages[{index}]": rule for index, rule in rules if rule.names}
         self.failover = Failover(self.lease_s)
         self.schedule = FaultSchedule(self.specification, self.seed)
 
     @property
     def wakeup_s(self) -> float | None:
         """Time by which `step` must be called, on the clock of `now_s`; None: any time."""
-        return min((due_s for due_s, _, _ in self._recoveries), default=None)
+        return min((recovery.due_s for recovery in self._recoveries), default=None)
 
     def message_rules(self) -> tuple[MessageRule, ...]:
         """Return the message rules, including those that implement partitions."""
@@ -130,21 +164,46 @@ class FaultInjection:
         Raises:
             CommandFailedError: a role cannot be restarted, or a link cannot be changed.
         """
+        if self._first_step_s is None:
+            self._first_step_s = now_s
+        self._road_s, self._run_s = road_s, now_s - self._first_step_s
         self._recover(now_s)
         self.failover.update(view, now_s)
-        self._waiting += self.schedule.due(road_s)
-        waiting, self._waiting = self._waiting, []
+        self.waiting += self.schedule.due(road_s)
+        waiting, self.waiting = self.waiting, []
         for event in waiting:
             name = self._choose(event, view)
             if name is None:
-                self._waiting.append(event)
+                self.waiting.append(event)
             else:
-                self._apply(event, name, road_s, now_s, view)
-        self._change_links(road_s)
+                self._apply(event, name, now_s, view)
+        self._begin_and_end_windows(road_s)
+
+    def skip(self, road_s: float) -> None:
+        """Drop the kills and pauses that were due before a road time; call it before `step`."""
+        self.schedule.skip(road_s)
+
+    def resume_paused(self) -> None:
+        """Resume all paused roles now; call it if `step` is not called any more."""
+        paused = [one for one in self._recoveries if not one.restarts]
+        self._recoveries = []
+        for recovery in paused:
+            self.roles.resume(recovery.role)
+        for recovery in paused:
+            self._report(recovery.fault_name, "resumed", recovery.role)
+
+    @property
+    def finished(self) -> bool:
+        """Whether all kills and pauses have been applied, and undone where they are undone."""
+        return not self.waiting and not self._recoveries and self.schedule.is_empty
 
     def unused_faults(self) -> list[str]:
         """Return a line for each fault that had no effect."""
-        return self.schedule.unused_faults(set(self._targets))
+        return self.schedule.unused_faults(set(self._targets)) + [
+            f"{' and '.join(rule.names)} did not run while {name} was in force"
+            for name, rule in self._unmet.items()
+            if name in self._began
+        ]
 
     def results(self, dropped: int) -> dict[str, Any]:
         """Return the fault-related arguments of `complete_summary`.
@@ -168,11 +227,19 @@ class FaultInjection:
     # --- kills and pauses ---------------------------------------------------------------------
 
     def _recover(self, now_s: float) -> None:
-        due = [recovery for recovery in self._recoveries if recovery[0] <= now_s]
-        self._recoveries = [recovery for recovery in self._recoveries if recovery[0] > now_s]
-        for _, role, recover in due:
-            self._paused.discard(role)
-            recover(role)
+        due = [recovery for recovery in self._recoveries if recovery.due_s <= now_s]
+        self._recoveries = [recovery for recovery in self._recoveries if recovery.due_s > now_s]
+        for recovery in due:
+            role = recovery.role
+            if recovery.restarts:
+                self.roles.restart(role)
+                self._report(recovery.fault_name, "restarted", role)
+            else:
+                self._paused.discard(role)
+                exited = role not in self.roles.running
+                self.roles.resume(role)
+                if not exited:
+                    self._report(recovery.fault_name, "resumed", role)
 
     def _choose(self, event: FaultEvent, view: RoadView) -> str | None:
         running = [name for name in self.roles.running if name not in self._paused]
@@ -196,53 +263,90 @@ class FaultInjection:
         agents = {self.roles.agent_of(entry.vehicle) for entry in entries}
         return {name for name in agents if name is not None}
 
-    def _apply(
-        self, event: FaultEvent, name: str, road_s: float, now_s: float, view: RoadView
-    ) -> None:
-        self._targets.setdefault(event.fault_name, set()).add(name)
-        self._record(road_s, event.fault_name, event.fault.verb, name)
+    def _apply(self, event: FaultEvent, name: str, now_s: float, view: RoadView) -> None:
+        fault = event.fault_name
+        self._targets.setdefault(fault, set()).add(name)
+        self._record(fault, event.fault.verb, name)
         if event.for_s is not None:
             self.roles.pause(name)
             self._paused.add(name)
-            self._recoveries.append((now_s + event.for_s, name, self.roles.resume))
+            self._recoveries.append(Recovery(now_s + event.for_s, fault, name, restarts=False))
         else:
             self.roles.kill(name)
             if event.restart_after_s is not None:
                 restart_s = now_s + event.restart_after_s
-                self._recoveries.append((restart_s, name, self.roles.restart))
+                self._recoveries.append(Recovery(restart_s, fault, name, restarts=True))
+        self._report(fault, event.fault.verb, name)
+        if name == BRIDGE:
+            self.end = f"the bridge was killed at {self._road_s:.1f} s by {fault}"
         if name == view.leader:
             self.failover.on_leader_fault(view, now_s, event.for_s)
 
-    def _record(self, road_s: float, fault: str, verb: str, target: str) -> None:
-        self.injected.append({"t_s": round(road_s, 3), "fault": fault, verb: target})
-        log.warning(verb, target=target, t_s=road_s, fault=fault)
+    def _record(self, fault: str, verb: str, target: str) -> None:
+        self.injected.append({"t_s": round(self._road_s, 3), "fault": fault, verb: target})
+        log.warning(verb, target=target, t_s=self._road_s, fault=fault)
 
-    # --- links --------------------------------------------------------------------------------
+    def _report(self, fault: str, action: str, target: str) -> None:
+        data = {"role": LAUNCHER, "fault": fault, "action": action, "target": target}
+        self.log_event(round(self._road_s, 3), data | {"run_s": round(self._run_s, 3)})
+
+    # --- rules, partitions and links ----------------------------------------------------------
 
     def _uses_links(self, partition: Partition) -> bool:
         return self.network is not None and partition.may_use_links
 
-    def _change_links(self, road_s: float) -> None:
-        """Begin and end partitions and faults of links."""
-        faults = self.specification.timed_faults()
-        in_force = {name: fault for name, fault in faults if fault.holds(road_s)}
-        if in_force.keys() == self._in_force:
+    def _begin_and_end_windows(self, road_s: float) -> None:
+        """Begin and end rules, partitions and faults of links, and note which rules have met.
+
+        The road may advance by more than the length of a window between two steps.
+        """
+        windows = dict(self.specification.windows())
+        began = {
+            name
+            for name, window in windows.items()
+            if window.from_s <= road_s and name not in self._began
+        }
+        ended = {
+            name
+            for name in (self._began | began) - self._ended
+            if (until_s := windows[name].until_s) is not None and until_s <= road_s
+        }
+        self._began |= began
+        self._ended |= ended
+        for name in self._unmet.keys() & (began | self._began - self._ended):
+            if all(map(self._runs, self._unmet[name].names)):
+                del self._unmet[name]
+        if not began and not ended:
             return
-        if self.network is not None:
-            links: dict[str, Link] = {}
-            for fault in in_force.values():
-                if isinstance(fault, LinkFault):
-                    links = dict.fromkeys(fault.groups, _state(fault)) | links
-                elif self._uses_links(fault):
-                    links[fault.between[0]] = Link(up=False)
-            try:
-                self.network.set_links(links)
-            except NamespacesUnavailableError as error:
-                raise CommandFailedError(f"cannot change a link: {error}") from error
-        for name in sorted(in_force.keys() ^ self._in_force):
-            kind = name.partition("[")[0]
-            self._record(road_s, name, kind, "began" if name in in_force else "ended")
-        self._in_force = set(in_force)
+        self._set_links()
+        for names, action in ((began, "began"), (ended, "ended")):
+            for name in sorted(names):
+                window = windows[name]
+                if not isinstance(window, MessageRule):
+                    self._record(name, name.partition("[")[0], action)
+                self._report(name, action, window.label)
+
+    def _runs(self, process: str) -> bool:
+        """Return whether a coordinator, or the agent of a vehicle, runs."""
+        running = self.roles.running
+        return process in running or self.roles.agent_of(process) in running
+
+    def _set_links(self) -> None:
+        """Let the network's links be as the faults in force say."""
+        if self.network is None:
+            return
+        links: dict[str, Link] = {}
+        for name, fault in self.specification.timed_faults():
+            if name not in self._began or name in self._ended:
+                continue
+            if isinstance(fault, LinkFault):
+                links = dict.fromkeys(fault.groups, _state(fault)) | links
+            elif self._uses_links(fault):
+                links[fault.between[0]] = Link(up=False)
+        try:
+            self.network.set_links(links)
+        except NamespacesUnavailableError as error:
+            raise CommandFailedError(f"cannot change a link: {error}") from error
 
 
 def _state(fault: LinkFault) -> Link:

@@ -14,14 +14,7 @@ from operator import attrgetter
 
 from attrs import field, frozen
 
-from laneweave.launch.faults.fault_file import (
-    FaultSpec,
-    Kill,
-    Pause,
-    RoleFault,
-    TimedFault,
-)
-from laneweave.protocol.runtime.message_faults import MessageRule
+from laneweave.launch.faults.fault_file import FaultSpec, Kill, Pause, RoleFault
 
 
 @frozen
@@ -49,6 +42,8 @@ class FaultSchedule:
         seed = specification.seed_of_run(seed)
         self._specification = specification
         self._reached_s = 0.0
+        self._skipped: dict[str, float] = {}
+        """Faults of which events were dropped, and the road time then."""
         self._coming = heapq.merge(
             *(_events(seed, name, fault) for name, fault in specification.role_faults()),
             key=attrgetter("due_s"),
@@ -62,23 +57,33 @@ class FaultSchedule:
             yield self._next
             self._next = next(self._coming, None)
 
+    def skip(self, road_s: float) -> None:
+        """Drop the events that were due before a road time."""
+        while self._next is not None and self._next.due_s < road_s:
+            self._skipped[self._next.fault_name] = road_s
+            self._next = next(self._coming, None)
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether no events are left."""
+        return self._next is None
+
     def unused_faults(self, applied: set[str]) -> list[str]:
         """Return a line for each fault that had no effect during the run.
 
         `applied` contains the names of the faults with at least one applied event.
         """
         lines = [
-            f"the run ended before {fault.target} was {fault.verb} at {fault.from_s:g} s"
+            f"{fault.target} was not {fault.verb} at {fault.from_s:g} s: the road was at "
+            f"{self._skipped[name]:.1f} s already"
+            if name in self._skipped
+            else f"the run ended before {fault.target} was {fault.verb} at {fault.from_s:g} s"
             for name, fault in self._specification.role_faults()
             if name not in applied
         ]
-        windows: list[tuple[str, MessageRule | TimedFault]] = [
-            *((f"messages[{i}]", rule) for i, rule in enumerate(self._specification.messages)),
-            *self._specification.timed_faults(),
-        ]
         lines += [
             f"the run ended before {name} came into force at {window.from_s:g} s"
-            for name, window in windows
+            for name, window in self._specification.windows()
             if window.from_s > self._reached_s
         ]
         return lines

@@ -99,9 +99,14 @@ class MessageFaults:
     counter: int
     """Index of this process's counter."""
     receiver: str
+    """Kind of the process."""
+    names: tuple[str, ...]
+    """Name of the process, or of each vehicle that it drives."""
     seed: str
 
     def wrap(self, core: Core) -> Core:
         """Return a core that applies these message faults to `core`."""
         board = ProcessBoard(self.board, self.counter)
-        return FaultyCore(core, self.rules, board, receiver=self.receiver, seed=self.seed)
+        return FaultyCore(
+            core, self.rules, board, receiver=self.receiver, seed=self.seed, names=self.names
+        )

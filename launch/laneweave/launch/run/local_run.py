@@ -16,10 +16,11 @@ from pathlib import Path
 from typing import Any
 
 import attrs
+import structlog
 from attrs import Factory, define, field
 
 from laneweave.coordinator.planning.kernels import KERNELS
-from laneweave.launch.faults.fault_file import ROUTER, SENDER_OF_GROUP, FaultSpec
+from laneweave.launch.faults.fault_file import BRIDGE, ROUTER, SENDER_OF_GROUP, FaultSpec
 from laneweave.launch.faults.injection import FaultInjection
 from laneweave.launch.faults.network_namespaces import ENDPOINT, HUB, LISTEN, open_network
 from laneweave.launch.faults.shared_counters import MessageFaults, SharedBoard
@@ -28,9 +29,9 @@ from laneweave.launch.observe.road_view import RoadView
 from laneweave.launch.run.logs import last_error
 from laneweave.launch.run.outcome import Outcome, complete_summary
 from laneweave.launch.run.progress import RunProgress
-from laneweave.launch.run.role_processes import BRIDGE, RoleExit, RoleProcesses, RoleStart
+from laneweave.launch.run.role_processes import RoleExit, RoleProcesses, RoleStart
 from laneweave.launch.run.roles import BAD_INPUT, fork_server
-from laneweave.launch.run.run_folder import LOG_FILE, ROUTER_READY_FILE
+from laneweave.launch.run.run_folder import EVENTS_FILE, LOG_FILE, ROUTER_READY_FILE
 from laneweave.protocol.config.participants import coordinator_names
 from laneweave.protocol.config.scenario_files import to_tables
 from laneweave.protocol.errors import BadInputError, CommandFailedError, RefusedError
@@ -42,8 +43,10 @@ from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.security.access_control import access_of
 from laneweave.protocol.security.certificates import check_credentials
 from laneweave.protocol.transports.zenoh.transport import ZenohTransport
+from laneweave.protocol.wire.events import FAULT_INJECTED
 from laneweave.protocol.wire.identities import Incarnations
 from laneweave.protocol.wire.topics import Keys
+from laneweave.sim_bridge.recording.events import append_event
 from laneweave.sim_bridge.road_sources import RunDemand, demand_of
 
 OBSERVER = "observer.watch"
@@ -58,6 +61,7 @@ MAX_FAILED_AGENTS = 5
 LEADER_S = 5.0
 """Maximum wait for a leader before the bridge starts, in addition to two election timeouts."""
 POLL_S = 0.1
+log = structlog.get_logger(__name__)
 _GROUP_OF_SENDER = {sender: group for group, sender in SENDER_OF_GROUP.items()}
 
 
@@ -151,6 +155,7 @@ class LocalRun:
                 if self.faults:
                     self._board = SharedBoard(temporary / "board")
                     self._injection = fault_injection(self.faults, self.scenario, self._processes)
+                    self._injection.log_event = self._log_fault
                 self._supervise(progress)
             except CommandFailedError as error:
                 # Processes that a signal has ended, too, are no failure.
@@ -166,6 +171,7 @@ class LocalRun:
                 self.folder,
                 problems=self._problems,
                 interrupted=self._stop,
+                cut_short=injection is not None and bool(injection.end),
                 processes=processes,
                 **results,
             )
@@ -214,6 +220,9 @@ class LocalRun:
                 if injection is not None:
                     board_s = self._board.road_s
                     injection.step(board_s, now, view)
+                    if injection.end:
+                        self._problems.append(injection.end)
+                        return
                     # Faults may drop clock messages to the launcher.
                     road_s = max(road_s, board_s)
                 if self.watch is not None:
@@ -293,6 +302,13 @@ class LocalRun:
                 del self._group_of[vehicle]
             if group:
                 yield group
+
+    def _log_fault(self, t_s: float, data: Mapping[str, object]) -> None:
+        """Write an event to the file of the bridge, which cannot receive it if it is dead."""
+        try:
+            append_event(self.folder / EVENTS_FILE, t_s, FAULT_INJECTED, data)
+        except OSError as error:
+            log.critical("a fault is not recorded", reason=str(error), **data)
 
     def _request_stop(self) -> None:
         self._stop = True
@@ -376,6 +392,7 @@ def add_faults(
         board.path,
         board.new_counter(),
         receiver=sender,
+        names=tuple(start.options.get("vehicles", (start.name,))),
         seed=injection.seed_of_start(start.name),
     )
 

@@ -67,6 +67,7 @@ def complete_summary(
     *,
     problems: Sequence[str],
     interrupted: bool = False,
+    cut_short: bool = False,
     processes: int | None = None,
     failover: Failover | None = None,
     dropped: int = 0,
@@ -78,6 +79,8 @@ def complete_summary(
         folder: the run's folder.
         problems: problems known so far.
         interrupted: whether a signal has asked the run to end.
+        cut_short: whether a fault has ended the run, as `problems` says; that vehicles are left on
+            the road is no further problem.
         processes: maximum number of simultaneous role processes; None: unknown.
         failover: measured recoveries from leader faults; None: no faults.
         dropped: number of messages dropped by faults.
@@ -114,7 +117,7 @@ def complete_summary(
     of_sumo = trips.is_file() and bool(scenario_of(trips).sumo.config)
     # A signal may arrive when the run is already complete.
     interrupted = interrupted and summary.ending == Ending.INTERRUPTED.value
-    violations = _violations(summary, interrupted=interrupted, of_sumo=of_sumo)
+    violations = _violations(summary, interrupted=interrupted or cut_short, of_sumo=of_sumo)
     return Outcome(folder, summary, (*problems, *violations), interrupted)
 
 
@@ -131,7 +134,7 @@ def _violations(summary: RunSummary, *, interrupted: bool, of_sumo: bool) -> lis
 
     Args:
         summary: summary of the run.
-        interrupted: whether a signal has ended the run, which is then not complete.
+        interrupted: whether a signal or a fault has ended the run, which is then not complete.
         of_sumo: whether vehicles come from a SUMO simulation. Then a complete run may leave some
             outside: SUMO drives them elsewhere, or their exits are full.
     """

@@ -13,13 +13,11 @@ from typing import Any
 import structlog
 from attrs import define, field, frozen
 
-from laneweave.launch.faults.fault_file import ROUTER
+from laneweave.launch.faults.fault_file import BRIDGE, ROUTER
 from laneweave.launch.run.roles import end_role, start_role
 
 log = structlog.get_logger(__name__)
 
-BRIDGE = "bridge"
-"""Role and name of the bridge's process."""
 STOP_S = 5.0
 """Grace period after the request to end before processes are killed."""
 WRITING_S = 30.0

@@ -13,7 +13,7 @@ from attrs import Factory, define, field
 from laneweave.agents.core import AgentCore
 from laneweave.agents.host import AgentHost
 from laneweave.coordinator.core import CoordinatorCore
-from laneweave.launch.faults.fault_file import ROUTER, FaultSpec
+from laneweave.launch.faults.fault_file import BRIDGE, ROUTER, FaultSpec
 from laneweave.launch.faults.injection import FaultInjection
 from laneweave.launch.faults.shared_counters import LocalBoard
 from laneweave.launch.observe.observer import TOPICS
@@ -29,6 +29,7 @@ from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.summary import Ending
 from laneweave.protocol.transports.simulated.network import SimulatedNetwork
 from laneweave.protocol.transports.simulated.virtual_time import Conditions
+from laneweave.protocol.wire.events import FAULT_INJECTED
 from laneweave.protocol.wire.messages import Census, Name
 from laneweave.sim_bridge.core import BridgeCore, TickPhase
 from laneweave.sim_bridge.recording.run_record import RunRecord
@@ -78,7 +79,7 @@ class SimulatedRoles:
     def running(self) -> Collection[str]:
         """Names of the running roles."""
         router = (ROUTER,) if self._router_runs else ()
-        roles = (*self.coordinators, *self.agents.values())
+        roles = (BRIDGE, *self.coordinators, *self.agents.values())
         return [*(name for name in roles if name in self.network), *router]
 
     def agent_of(self, vehicle: str) -> str | None:
@@ -150,16 +151,20 @@ class SimulatedRun:
         self.folder.mkdir(parents=True, exist_ok=True)
         network = SimulatedNetwork(scenario.seed, self.conditions, skip_codec=True)
         self._roles = SimulatedRoles(network, coordinator_names(scenario), self._start)
-        if self.faults:
-            self._injection = FaultInjection(
-                self.faults, scenario.seed, self._roles, self.conditions.lease_s
-            )
         with (
             stop_signals(self._request_stop),
             open_road(self.demand, self.folder) as road,
             RunProgress(scenario, show=self.show_progress) as progress,
         ):
             record = RunRecord(self.folder, scenario, FORMATION, time.perf_counter, road.left_out)
+            if self.faults:
+                self._injection = FaultInjection(
+                    self.faults,
+                    scenario.seed,
+                    self._roles,
+                    self.conditions.lease_s,
+                    log_event=lambda t_s, data: record.event(t_s, FAULT_INJECTED, **data),
+                )
             bridge = BridgeCore(
                 scenario,
                 road.world,
@@ -172,17 +177,21 @@ class SimulatedRun:
             try:
                 self._drive(network, bridge, progress)
             finally:
-                record.close(bridge.t_s, Ending.INTERRUPTED)
+                killed = self._injection is not None and self._injection.end
+                record.close(bridge.t_s, Ending.UNFINISHED if killed else Ending.INTERRUPTED)
         dropped = network.dropped + self._board.dropped
         results: dict[str, Any] = {"dropped": dropped}
         if self._injection is not None:
-            if not self._stop:
+            if killed:
+                self._problems.append(self._injection.end)
+            elif not self._stop:
                 self._problems += self._injection.unused_faults()
             results = self._injection.results(dropped)
         return complete_summary(
             self.folder,
             problems=self._problems,
             interrupted=self._stop,
+            cut_short=bool(killed),
             processes=1,
             **results,
         )
@@ -195,7 +204,7 @@ class SimulatedRun:
         network.add("watcher", _ObserverCore(self._view, self._start_agents), realm)
         for name in self._roles.coordinators:
             self._start(name)
-        self._add("bridge", bridge, "bridge")
+        self._add(BRIDGE, bridge, "bridge", BRIDGE)
         shown = advanced_tick = 0
         advanced_s = 0.0
         while bridge.phase is not TickPhase.ENDED and network.queue and not self._stop:
@@ -204,6 +213,8 @@ class SimulatedRun:
             else:
                 network.step()
                 self._inject(self._injection, network.now_s)
+                if self._injection.end:
+                    return
             if bridge.tick != advanced_tick:
                 advanced_tick, advanced_s = bridge.tick, network.now_s
             elif network.now_s - advanced_s > STALL_S:
@@ -243,18 +254,28 @@ class SimulatedRun:
         if name in self._roles.coordinators:
             incarnation = next(self._coordinator_incarnations)
             core = CoordinatorCore(Name(name), incarnation, self.scenario)
-            self._add(name, core, "coordinator")
+            self._add(name, core, "coordinator", name)
         else:
             vehicle = Name(name.removeprefix(AGENT_PREFIX))
             incarnation, runtime = next(self._incarnations), self.scenario.runtime
             host = AgentHost(self._make_agent, incarnation, runtime, [vehicle])
-            self._add(name, host, "vehicle")
+            self._add(name, host, "vehicle", vehicle)
 
-    def _add(self, name: str, core: Core, receiver: str) -> None:
+    def _add(self, name: str, core: Core, receiver: str, own_name: str) -> None:
+        """Add a role to the network.
+
+        Args:
+            name: name of the role.
+            core: the role.
+            receiver: its kind in message rules.
+            own_name: its name in message rules.
+        """
         injection = self._injection
         if injection is not None:
             rules, seed = injection.message_rules(), injection.seed_of_start(name)
-            core = FaultyCore(core, rules, self._board, receiver=receiver, seed=seed)
+            core = FaultyCore(
+                core, rules, self._board, receiver=receiver, seed=seed, names=(own_name,)
+            )
         self._roles.network.add(name, core, self.scenario.network.realm)
 
     def _make_agent(self, vehicle: Name) -> AgentCore:

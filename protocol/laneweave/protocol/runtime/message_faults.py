@@ -19,7 +19,8 @@ import attrs
 from attrs import field, frozen
 
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.field_validators import one_of, within, within_or_none
+from laneweave.protocol.field_validators import within, within_or_none
+from laneweave.protocol.names import NAME_PATTERN
 from laneweave.protocol.runtime.metrics import MetricsSnapshot
 from laneweave.protocol.runtime.node import (
     Arrived,
@@ -30,14 +31,17 @@ from laneweave.protocol.runtime.node import (
     Wakeup,
     core_metrics,
 )
-from laneweave.protocol.wire.messages import RoadClock
+from laneweave.protocol.structuring import KEY
+from laneweave.protocol.wire.messages import Plan, Prepare, RoadClock
 from laneweave.protocol.wire.topics import ANY_SENDER, ROLES, TOPICS, Party
 
 SENDER_OF_ROLE = {role: str(party) for party, role in ROLES.items() if party is not Party.FLEET}
-"""Kind of sender in message rules, by role; fleets send as their vehicles."""
+"""Kind of process in message rules, by role; fleets send as their vehicles."""
 SENDERS = tuple(SENDER_OF_ROLE.values())
+"""Kinds of processes that send and receive messages."""
 MESSAGE_TOPICS = tuple(topic.name for topic in TOPICS if topic.kind is not None)
-_SENDER = attrs.validators.optional(one_of(*SENDERS))
+Route = tuple[str | None, str | None]
+"""Sender and receiver of messages, each the kind or the name of a process; None: any."""
 CoreWrapper = Callable[[Core], Core]
 """Wraps a core, or returns it unchanged."""
 MAX_HELD = 10_000
@@ -50,9 +54,24 @@ def _message_topics(_: object, attribute: attrs.Attribute[Any], value: tuple[str
             raise BadInputError(attribute.name, name, "any of " + ", ".join(MESSAGE_TOPICS))
 
 
+def _process(_: object, attribute: attrs.Attribute[Any], value: str) -> None:
+    if not NAME_PATTERN.fullmatch(value):
+        allowed = f"{', '.join(SENDERS)}, or the name of a coordinator or a vehicle"
+        raise BadInputError(attribute.name, value, allowed)
+
+
+def _processes(_: object, attribute: attrs.Attribute[Any], value: tuple[str, str]) -> None:
+    for one in value:
+        _process(None, attribute, one)
+    if value[0] == value[1] and value[0] not in SENDERS:
+        raise BadInputError(attribute.name, list(value), "two different processes")
+
+
 @frozen(kw_only=True)
 class MessageRule:
     """Rule for message faults; the rules of a run are applied in order.
+
+    A rule affects a message if topic, time, sender and receiver all match.
 
     Raises:
         BadInputError: a value is invalid.
@@ -72,19 +91,51 @@ class MessageRule:
     """Road time at which the rule starts; 0: also before the road's clock starts."""
     until_s: float | None = field(default=None, validator=within_or_none(0.0, 1e6))
     """Road time at which the rule ends; None: when the run ends."""
-    sender: str | None = field(default=None, validator=_SENDER)
-    """Kind of sender; None: any."""
-    receiver: str | None = field(default=None, validator=_SENDER)
-    """Kind of receiver; None: any."""
+    sender: str | None = field(
+        default=None, validator=attrs.validators.optional(_process), metadata={KEY: "from"}
+    )
+    """Kind or name of the sender; None: any."""
+    receiver: str | None = field(
+        default=None, validator=attrs.validators.optional(_process), metadata={KEY: "to"}
+    )
+    """Kind or name of the receiver; None: any."""
+    between: tuple[str, str] | None = field(
+        default=None, validator=attrs.validators.optional(_processes)
+    )
+    """Two kinds or names, one of which sends and the other receives; None: as `sender` and
+    `receiver` say."""
 
     def __attrs_post_init__(self) -> None:
         """Check the fields against each other."""
+        if self.between is not None and (self.sender, self.receiver) != (None, None):
+            raise BadInputError("between", list(self.between), "nothing if from or to is given")
         if self.until_s is not None and self.until_s <= self.from_s:
             raise BadInputError("until_s", self.until_s, f"more than from_s, {self.from_s:g}")
 
-    def is_active(self, road_s: float) -> bool:
-        """Return whether the rule applies at a road time."""
+    def holds(self, road_s: float) -> bool:
+        """Return whether the rule is in force at a road time."""
         return self.from_s <= road_s and (self.until_s is None or road_s < self.until_s)
+
+    @property
+    def routes(self) -> tuple[Route, ...]:
+        """Senders and receivers whose messages the rule affects."""
+        if self.between is None:
+            return ((self.sender, self.receiver),)
+        first, second = self.between
+        return (first, second), (second, first)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the single processes in the rule."""
+        parties = self.between or (self.sender, self.receiver)
+        return tuple(one for one in parties if one is not None and one not in SENDERS)
+
+    @property
+    def label(self) -> str:
+        """Senders and receivers in words."""
+        if self.between is not None:
+            return " and ".join(self.between)
+        return f"{self.sender or 'all'} to {self.receiver or 'all'}"
 
 
 class FaultBoard(Protocol):
@@ -107,6 +158,7 @@ class FaultyCore:
         *,
         receiver: str,
         seed: str,
+        names: Iterable[str] = (),
     ) -> None:
         """Wrap a core.
 
@@ -116,11 +168,17 @@ class FaultyCore:
             board: shared road time and counter.
             receiver: kind of receiver, one of `SENDERS`.
             seed: seed of all draws, unique to the process.
+            names: name of the process, or of each vehicle that it drives.
         """
         self.core = core
         self._board = board
-        self._rules = tuple(rule for rule in rules if rule.receiver in (None, receiver))
-        self._rules_for: dict[str, tuple[MessageRule, ...]] = {}
+        self._kind = receiver
+        self._receivers = frozenset((None, receiver, *names))
+        self._rules = tuple(
+            rule for rule in rules if any(to in self._receivers for _, to in rule.routes)
+        )
+        self._rules_for: dict[str, tuple[tuple[MessageRule, tuple[Route, ...]], ...]] = {}
+        """Rules of each topic, with their routes."""
         self._seed = seed
         self._generators: dict[str, random.Random] = {}
         self._held: list[tuple[float, int, Arrived]] = []
@@ -179,14 +237,18 @@ class FaultyCore:
         rules = self._rules_for.get(name)
         if rules is None:
             rules = self._rules_for[name] = tuple(
-                rule for rule in self._rules if not rule.topics or name in rule.topics
+                (rule, rule.routes)
+                for rule in self._rules
+                if not rule.topics or name in rule.topics
             )
         if not rules:
             return delays_s
-        road_s, sender = self._board.road_s, _sender(arrived)
+        road_s, senders, receivers = self._board.road_s, _senders(arrived), self._to(arrived)
         draw = self._generator(name).random
-        for rule in rules:
-            if not rule.is_active(road_s) or rule.sender not in (None, sender):
+        for rule, routes in rules:
+            if not rule.holds(road_s):
+                continue
+            if not any(source in senders and to in receivers for source, to in routes):
                 continue
             # Always draw both, so that duplicates do not depend on loss.
             lost, doubled = draw() < rule.loss, draw() < rule.duplication
@@ -197,6 +259,16 @@ class FaultyCore:
                 for delay_s in delays_s * (2 if doubled else 1)
             ]
         return delays_s
+
+    def _to(self, arrived: Arrived) -> frozenset[str | None]:
+        """Return which receivers in rules mean the receiver of a message.
+
+        A message to one of several vehicles in this process is received by that vehicle, any other
+        message by all of them.
+        """
+        if arrived.topic.addressee is not Party.VEHICLE or self._kind != Party.VEHICLE:
+            return self._receivers
+        return frozenset((None, self._kind, arrived.parameters.get("vehicle")))
 
     def _generator(self, topic: str) -> random.Random:
         generator = self._generators.get(topic)
@@ -212,9 +284,12 @@ def unwrapped(core: Core) -> Core:
     return core
 
 
-def _sender(arrived: Arrived) -> str:
-    sender = arrived.topic.sender
-    if sender != ANY_SENDER:
-        return sender
-    role = arrived.parameters.get("role", "")
-    return SENDER_OF_ROLE.get(role, role)
+def _senders(arrived: Arrived) -> tuple[str | None, ...]:
+    """Return which senders in rules mean the sender of a message: any, its kind, its name."""
+    kind, parameters, message = arrived.topic.sender, arrived.parameters, arrived.message
+    if kind == ANY_SENDER:
+        role = parameters.get("role", "")
+        return None, SENDER_OF_ROLE.get(role, role), parameters.get("name")
+    if isinstance(message, Prepare | Plan):
+        return None, kind, message.ballot.coordinator
+    return None, kind, parameters.get(kind, kind)

@@ -69,6 +69,8 @@ SETTINGS_REFUSED: Final = "settings-refused"
 """Bridge: a process has other settings than the bridge, and so does not act on its road."""
 OVERLAP: Final = "overlap"
 """Bridge: two bodies intersect; a closed part of a lane counts as a body named `closure-N`."""
+FAULT_INJECTED: Final = "fault-injected"
+"""Launcher, or `laneweave faults apply`: a fault has begun, ended, or affected a process."""
 RUN_ENDED: Final = "run-ended"
 """Bridge: the run has ended."""
 
@@ -117,15 +119,16 @@ FIELDS: Final[Mapping[str, tuple[str, ...]]] = {
     COMMAND_REFUSED: ("vehicle", "reason", "excess_m", "occupant"),
     SETTINGS_REFUSED: ("process", "incarnation", "settings"),
     OVERLAP: ("vehicles",),
+    FAULT_INJECTED: ("fault", "action", "target", "run_s"),
     RUN_ENDED: ("ending", "leader_until_s"),
 }
 """Data of each event, beside `COMMON_FIELDS`."""
 COMMON_FIELDS: Final = ("t_s", "kind", "role", "name")
-"""Keys of every line; `name` is absent from events of the bridge."""
+"""Keys of every line; `name` is absent from events of the bridge and of the launcher."""
 MEANINGS: Final[Mapping[str, str]] = {
     "t_s": "road time [s]",
     "kind": "kind of the event",
-    "role": "role of the sender: bridge or coordinator",
+    "role": "role of the sender: bridge, coordinator or launcher",
     "name": "name of the coordinator",
     "term": "term of the leader",
     "coordinator": "name of the leader",
@@ -177,6 +180,12 @@ MEANINGS: Final[Mapping[str, str]] = {
     "process": "role and name of the process that was refused",
     "incarnation": "incarnation of this process",
     "settings": "settings that differ: value of the bridge, value of the process",
+    "fault": "table of the fault file, such as kill[0]",
+    "action": "killed, restarted, paused or resumed; of rules, partitions, links: began or ended",
+    "target": "process; senders and receivers of the rule; groups of the partition; group of the "
+    "link",
+    "run_s": "time since the bridge was started, or since `faults apply` found the road [s, wall "
+    "clock; simulated: virtual time]",
     "ending": "as in summary.json",
 }
 """What each field means."""

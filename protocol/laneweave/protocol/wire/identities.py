@@ -79,6 +79,14 @@ class Incarnations:
         return number
 
 
+def process_id_of(incarnation: int) -> int:
+    """Return the id of the process with an incarnation, if it runs on this host.
+
+    For a process of another host or container, the result is arbitrary.
+    """
+    return (incarnation ^ _host_hash()) % _STEP
+
+
 def _host_hash() -> int:
     """Return a hash of the machine, since its last boot, and of the container (PID namespace)."""
     try:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from laneweave.protocol.files import overwrite
+from laneweave.protocol.files import append
 from laneweave.protocol.scenario.formation_table import SOLVERS, solver_of_event
 from laneweave.protocol.summary import Planning, PlanningMs
 from laneweave.protocol.wire.events import PLAN_EVENTS
@@ -19,32 +19,49 @@ from laneweave.sim_bridge.recording.disk import Disk
 from laneweave.sim_bridge.recording.statistics import percentiles_of
 
 
+def line_of(t_s: float, kind: str, data: Mapping[str, object]) -> bytes:
+    """Return the line of an event.
+
+    Values that JSON does not support are written as text; keys `t_s` and `kind` in the data are
+    ignored.
+    """
+    own: dict[str, object] = {"t_s": t_s, "kind": kind}
+    return (json.dumps({**own, **data, **own}, default=str) + "\n").encode()
+
+
+def append_event(path: Path, t_s: float, kind: str, data: Mapping[str, object]) -> None:
+    """Append an event to the file of a run, whose bridge may write to it at the same time.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    with path.open("ab", buffering=0) as file:
+        append(file, line_of(t_s, kind, data))
+
+
 class Events:
-    """Writer of events, each of which it writes at once; counts the plans among them."""
+    """Writer of events, each of which it writes at once; counts the plans among them.
+
+    It appends to the file, because the launcher of a run adds the faults that it injects.
+    """
 
     def __init__(self, path: Path, disk: Disk | None = None) -> None:
         """Open the file."""
         self._disk = disk or Disk()
-        self._file = path.open("wb+", buffering=0)
+        self._file = path.open("ab", buffering=0)
         self._plans = self._optimal = self._largest = self._fallbacks = 0
         self._by_solver = Counter(dict.fromkeys(SOLVERS, 0))
         self._solve_ms = array("d")
 
     def add(self, t_s: float, kind: str, data: Mapping[str, object]) -> None:
-        """Write an event; after `close`, ignore it.
-
-        Values that JSON does not support are written as text; keys `t_s` and `kind` in the data are
-        ignored.
-        """
+        """Write an event, as `line_of` does; after `close`, ignore it."""
         if self._file.closed:
             return
         if kind in PLAN_EVENTS:
             self._count_plan(kind, data)
-        own: dict[str, object] = {"t_s": t_s, "kind": kind}
-        line = json.dumps({**own, **data, **own}, default=str) + "\n"
         if self._disk.works:
             with self._disk.writing():
-                overwrite(self._file, self._file.tell(), line.encode())
+                append(self._file, line_of(t_s, kind, data))
 
     def close(self) -> None:
         """Close the file. Idempotent."""

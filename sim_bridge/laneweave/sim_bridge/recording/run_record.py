@@ -393,11 +393,15 @@ class RunRecord:
     # --- the end ------------------------------------------------------------------------------
 
     def close(self, t_s: float, ending: Ending) -> None:
-        """Write all files; only the first call has an effect."""
+        """Write all files; only the first call has an effect.
+
+        With the ending `UNFINISHED`, they are as if the process had been killed after `save`.
+        """
         if self._closed:
             return
-        until_s = self._leadership.until_s
-        self.event(t_s, RUN_ENDED, ending=ending.value, leader_until_s=until_s)
+        if ending is not Ending.UNFINISHED:
+            until_s = self._leadership.until_s
+            self.event(t_s, RUN_ENDED, ending=ending.value, leader_until_s=until_s)
         self._closed = True
         with self._disk.writing(), ExitStack() as closing:
             for file in (self._events, self._trajectories, self._trips, self._ticks):

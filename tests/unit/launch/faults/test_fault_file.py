@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -115,9 +116,55 @@ def test_a_file_may_have_every_field(tmp_path: Path) -> None:
     assert found
 
 
+def test_rules_name_single_processes(tmp_path: Path) -> None:
+    found = load(
+        tmp_path,
+        """
+        [[messages]]
+        loss = 1.0
+        from = "c1"
+        to = "v0002"
+        [[messages]]
+        delay_s = 0.2
+        between = ["v0001", "v0002"]
+        [[messages]]
+        loss = 0.5
+        from = "coordinator"
+        receiver = "vehicle"
+        """,
+    )
+    assert found.messages == (
+        MessageRule(loss=1.0, sender="c1", receiver="v0002"),
+        MessageRule(delay_s=0.2, between=("v0001", "v0002")),
+        MessageRule(loss=0.5, sender="coordinator", receiver="vehicle"),
+    )
+    assert [rule.label for rule in found.messages] == [
+        *("c1 to v0002", "v0001 and v0002", "coordinator to vehicle")
+    ]
+    tables = {"messages": [{"loss": 1.0, "from": "c1", "to": "v0002"}]}
+    assert load_faults(tables, COORDINATORS, VEHICLES).messages == found.messages[:1]
+
+
+def test_an_unknown_process_in_a_rule_has_its_line_and_the_known_ones(tmp_path: Path) -> None:
+    with pytest.raises(BadInputError) as caught:
+        load(tmp_path, '[[messages]]\nloss = 1\nfrom = "c3"')
+    line = str(caught.value)
+    assert line.startswith(
+        "messages[0].from: got 'c3'; allowed: vehicle, coordinator, bridge, c1, "
+    )
+    assert "faults.toml:3" in line
+
+
 @for_each(
     ("text", "field"),
     [
+        ('[[messages]]\nto = "v0003"', "messages[0].to"),
+        ('[[messages]]\nto = "vehicles"', "messages[0].to"),
+        ('[[messages]]\nbetween = ["v0001", "v0003"]', "messages[0].between"),
+        ('[[messages]]\nbetween = ["v0001"]', "messages[0].between"),
+        ('[[messages]]\nbetween = ["v0001", "v0001"]', "messages[0].between"),
+        ('[[messages]]\nbetween = ["v0001", "c1"]\nto = "c2"', "messages[0].between"),
+        ('[[messages]]\nfrom = "c 1"', "messages[0].from"),
         ('[[kill]]\ntarget = "c3"\nat_s = 1.0', "kill[0].target"),
         ('[[kill]]\nat_s = 1.0\n[[kill]]\ntarget = ""\nat_s = 1.0', "kill[1].target"),
         ('[[pause]]\ntarget = "v0003"\nat_s = 1.0\nfor_s = 1', "pause[0].target"),
@@ -179,8 +226,27 @@ def test_an_error_names_the_field(tmp_path: Path, text: str, field: str) -> None
 
 
 def test_an_error_lists_the_allowed_targets(tmp_path: Path) -> None:
-    with pytest.raises(BadInputError, match="allowed: leader, c1, c2, coordinator, router, agent"):
-        load(tmp_path, '[[kill]]\ntarget = "bridge"\nat_s = 1.0')
+    allowed = "allowed: leader, c1, c2, coordinator, router, bridge, agent"
+    with pytest.raises(BadInputError, match=allowed):
+        load(tmp_path, '[[kill]]\ntarget = "bride"\nat_s = 1.0')
+
+
+@for_each(
+    ("text", "field", "reason"),
+    [
+        ("[[kill]]\nat_s = 1\nrestart_after_s = 1", "kill[0].restart_after_s", "another road"),
+        ("[[kill]]\nat_s = 1\nevery_s = 1", "kill[0].every_s", "another road"),
+        ("[[kill]]\nbetween_s = [1, 2]\ntimes = 2", "kill[0].times", "another road"),
+        ("[[kill]]\nat_s = 1\ncount = 2", "kill[0].count", "1, or a target"),
+        ("[[pause]]\nat_s = 1\nfor_s = 1", "pause[0].target", "stops the road"),
+    ],
+)
+def test_the_bridge_can_be_killed_once(tmp_path: Path, text: str, field: str, reason: str) -> None:
+    with pytest.raises(BadInputError) as caught:
+        load(tmp_path, f'{text}\ntarget = "bridge"')
+    assert caught.value.field == field
+    assert reason in str(caught.value)
+    assert load(tmp_path, '[[kill]]\nat_s = 1\ntarget = "bridge"').kill[0].target == "bridge"
 
 
 # --- partitions -----------------------------------------------------------------------------------
@@ -217,6 +283,29 @@ def test_a_partition_has_a_window() -> None:
 def test_a_simulated_network_loses_no_packets() -> None:
     with pytest.raises(BadInputError, match=r"link: .*no packets"):
         FaultSpec(link=(LinkFault(loss=0.1),)).check_simulated()
+
+
+@for_each(
+    ("faults", "field"),
+    [
+        ({"messages": [{"loss": 1.0}]}, "messages"),
+        ({"partition": [{"between": ["bridge", "others"]}]}, "partition"),
+        ({"link": [{"loss": 0.1}]}, "link"),
+        ({"kill": [{"target": "router", "at_s": 1}]}, "kill[0].target"),
+        ({"kill": [{"at_s": 1, "restart_after_s": 1}]}, "kill[0].restart_after_s"),
+        ({"pause": [{"target": "router", "at_s": 1, "for_s": 1}]}, "pause[0].target"),
+    ],
+)
+def test_what_is_not_possible_from_outside_is_refused(faults: dict[str, Any], field: str) -> None:
+    with pytest.raises(BadInputError, match="from outside") as caught:
+        load_faults(faults, COORDINATORS).check_outside()
+    assert caught.value.field == field
+
+
+def test_kills_and_pauses_are_possible_from_outside() -> None:
+    kills = [{"target": name, "at_s": 1} for name in ("leader", "c1", "v0001", "agent", "bridge")]
+    faults = {"kill": kills, "pause": [{"at_s": 1, "for_s": 2}]}
+    load_faults(faults, COORDINATORS).check_outside()
 
 
 # --- presets --------------------------------------------------------------------------------------

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -25,11 +26,13 @@ from laneweave.launch.faults.network_namespaces import (
     NamespacesUnavailableError,
 )
 from laneweave.launch.faults.shared_counters import MessageFaults, SharedBoard
+from laneweave.launch.library.recorded_run import load_run
 from laneweave.launch.observe.road_view import RoadView
 from laneweave.launch.run.local_run import add_faults, fault_injection
 from laneweave.launch.run.outcome import Outcome
 from laneweave.launch.run.role_processes import RoleProcesses, RoleStart
 from laneweave.launch.run.roles import fork_server
+from laneweave.launch.run.run_folder import LOG_FILE, repair_run
 from laneweave.launch.run.simulated_run import SimulatedRun
 from laneweave.protocol.config.scenario_files import load_scenario, to_tables
 from laneweave.protocol.errors import BadInputError
@@ -266,6 +269,66 @@ def test_a_simulated_run_supports_almost_all_faults(
     assert done == [*kills, "pause[0]", "partition[0]", "partition[0]"]
     assert found.summary.faults["partition_methods"] == {"partition[0]": "messages"}
     assert len(found.summary.failover.recovery_s) == 1
+
+
+def events_of(folder: Path, kind: str) -> list[dict[str, Any]]:
+    lines = (folder / "events.jsonl").read_text(encoding="utf-8").splitlines()
+    return [event for event in map(json.loads, lines) if event["kind"] == kind]
+
+
+@pytest.mark.slow
+def test_rules_between_single_processes_in_a_simulated_run(
+    simulate: Callable[[str, FaultSpec], Outcome], tmp_path: Path
+) -> None:
+    """Without commands of its agent, only the named vehicle misses answers to ticks."""
+    faults = load_faults(
+        {
+            "messages": [
+                {"loss": 1.0, "from": "bridge", "to": "v0003", "until_s": 20.0},
+                {"loss": 1.0, "between": ["v0001", "v0002"]},
+            ]
+        },
+        ("c1", "c2", "c3"),
+    )
+    found = simulate("rules", faults)
+
+    assert found.problems == ()
+    assert found.summary is not None
+    assert found.summary.safety.overlaps == 0
+    assert found.summary.messages.dropped_by_faults > 0
+    silent = {one["vehicle"] for one in events_of(tmp_path / "rules", "caretaker-took-over")}
+    assert silent == {"v0003"}
+    assert [
+        (one["fault"], one["action"], one["target"], one["role"])
+        for one in events_of(tmp_path / "rules", "fault-injected")
+    ] == [
+        ("messages[0]", "began", "bridge to v0003", "launcher"),
+        ("messages[1]", "began", "v0001 and v0002", "launcher"),
+        ("messages[0]", "ended", "bridge to v0003", "launcher"),
+    ]
+
+
+@pytest.mark.slow
+def test_a_simulated_run_ends_with_its_killed_bridge(
+    simulate: Callable[[str, FaultSpec], Outcome], tmp_path: Path
+) -> None:
+    faults = FaultSpec(
+        kill=(Kill(at_s=8.0, target="bridge"), Kill(at_s=50.0)),
+    )
+    found = simulate("killed", faults)
+
+    assert found.problems == ("the bridge was killed at 8.0 s by kill[0]",)
+    assert found.exit_status == 1
+    folder = tmp_path / "killed"
+    (event,) = events_of(folder, "fault-injected")
+    assert (event["target"], event["action"], event["t_s"]) == ("bridge", "killed", 8.0)
+    assert events_of(folder, "run-ended") == []
+    recorded = load_run(folder)
+    assert recorded.summary.ending == "unfinished"
+    assert recorded.summary.simulated_s == pytest.approx(8.0, abs=0.2)
+    assert recorded.trajectories().num_rows > 0
+    (folder / LOG_FILE).touch()  # `new_folder` makes it
+    assert repair_run(folder).ending == "interrupted"
 
 
 @pytest.mark.parametrize(

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 from attrs import define, field
 
-from laneweave.launch.faults.fault_file import FaultSpec, Kill, Pause
+from laneweave.launch.faults.fault_file import FaultSpec, Kill, Partition, Pause
 from laneweave.launch.faults.injection import FaultInjection
 from laneweave.launch.observe.road_view import RoadView
+from laneweave.protocol.runtime.message_faults import MessageRule
 from laneweave.protocol.wire.messages import Census, CensusEntry, Heartbeat, Name
 from support.tables import for_each
 
@@ -26,7 +28,7 @@ class FakeRoles:
 
     @property
     def running(self) -> list[str]:
-        names = ("router", *self.coordinators, *(f"agent-{name}" for name in self.agents))
+        names = ("router", "bridge", *self.coordinators, *(f"agent-{name}" for name in self.agents))
         return [name for name in names if name not in self.dead]
 
     def agent_of(self, vehicle: str) -> str | None:
@@ -154,6 +156,106 @@ def test_a_pause_ends_after_wall_clock_time_and_a_paused_role_is_no_target() -> 
     assert roles.done == [("pause", "c2")]
     faults.step(7.0, 102.0, view)
     assert roles.done == [("pause", "c2"), ("resume", "c2"), ("kill", "c2")]
+
+
+# --- events -----------------------------------------------------------------------------------
+
+
+Logged = tuple[float, str, str, str, float]
+"""Road time, fault, action, target, time of the run."""
+
+
+def logged_by(faults: FaultInjection) -> list[Logged]:
+    """Return a list to which a fault engine adds its events."""
+    found: list[Logged] = []
+
+    def log(t_s: float, data: Mapping[str, Any]) -> None:
+        assert data["role"] == "launcher"
+        found.append((t_s, data["fault"], data["action"], data["target"], data["run_s"]))
+
+    faults.log_event = log
+    return found
+
+
+def test_each_effect_of_a_fault_is_an_event() -> None:
+    roles, view = FakeRoles(), on_road()
+    faults = injection(
+        roles,
+        kill=(Kill(at_s=5.0, target="v2", restart_after_s=1.0),),
+        pause=(Pause(at_s=6.0, target="c2", for_s=2.0),),
+        messages=(MessageRule(loss=0.5, sender="c1", from_s=7.0, until_s=9.0),),
+        partition=(Partition(between=("bridge", "others"), from_s=8.0, until_s=9.0),),
+    )
+    found = logged_by(faults)
+    # The road stands from 6 s on for two seconds, and then advances over the end of the windows.
+    for road_s, now_s in ((5.0, 100.0), (6.0, 101.0), (6.0, 103.0), (8.0, 103.5), (9.5, 104.0)):
+        faults.step(road_s, now_s, view)
+    assert found == [
+        (5.0, "kill[0]", "killed", "agent-v2", 0.0),
+        (6.0, "kill[0]", "restarted", "agent-v2", 1.0),
+        (6.0, "pause[0]", "paused", "c2", 1.0),
+        (6.0, "pause[0]", "resumed", "c2", 3.0),
+        (8.0, "messages[0]", "began", "c1 to all", 3.5),
+        (8.0, "partition[0]", "began", "bridge and others", 3.5),
+        (9.5, "messages[0]", "ended", "c1 to all", 4.0),
+        (9.5, "partition[0]", "ended", "bridge and others", 4.0),
+    ]
+    # The summary has no rules, and not what a fault undoes.
+    assert [one["fault"] for one in faults.injected] == [
+        *("kill[0]", "pause[0]", "partition[0]", "partition[0]")
+    ]
+
+
+def test_a_window_between_two_steps_is_not_lost() -> None:
+    faults = injection(FakeRoles(), messages=(MessageRule(loss=1.0, from_s=5.1, until_s=5.2),))
+    found = logged_by(faults)
+    for road_s in (5.0, 6.0, 7.0):
+        faults.step(road_s, road_s, on_road())
+    assert [(t_s, action) for t_s, _, action, *_ in found] == [(6.0, "began"), (6.0, "ended")]
+
+
+def test_a_paused_process_that_has_exited_is_not_resumed() -> None:
+    roles = FakeRoles()
+    faults = injection(roles, pause=(Pause(at_s=5.0, target="c2", for_s=2.0),))
+    found = logged_by(faults)
+    faults.step(5.0, 100.0, on_road())
+    roles.dead.add("c2")
+    faults.step(7.0, 102.0, on_road())
+    assert [action for _, _, action, *_ in found] == ["paused"]
+
+
+def test_the_killed_bridge_ends_the_run() -> None:
+    roles = FakeRoles()
+    faults = injection(roles, kill=(Kill(at_s=5.0, target="bridge"),))
+    found = logged_by(faults)
+    faults.step(4.0, 0.0, on_road())
+    assert faults.end == ""
+    faults.step(5.0, 1.0, on_road())
+    assert faults.end == "the bridge was killed at 5.0 s by kill[0]"
+    assert roles.done == [("kill", "bridge")]
+    assert found == [(5.0, "kill[0]", "killed", "bridge", 1.0)]
+
+
+@for_each(
+    ("names", "agents", "unused"),
+    [
+        (("c1", "v1"), ("v1",), []),
+        (("c1", "v1"), (), ["c1 and v1 did not run while messages[0] was in force"]),
+        (("c9", "vehicle"), ("v1",), ["c9 did not run while messages[0] was in force"]),
+    ],
+)
+def test_a_rule_for_a_process_that_never_runs_is_unused(
+    names: tuple[str, str], agents: tuple[str, ...], unused: list[str]
+) -> None:
+    roles = FakeRoles(agents=())
+    rule = MessageRule(loss=1.0, between=names, from_s=5.0, until_s=8.0)
+    faults = injection(roles, messages=(rule,))
+    faults.step(6.0, 0.0, on_road())
+    roles.agents = agents
+    faults.step(7.0, 1.0, on_road())
+    roles.agents = ("v1", "v2")
+    faults.step(9.0, 3.0, on_road())
+    assert faults.unused_faults() == unused
 
 
 # --- recovery -------------------------------------------------------------------------------------

@@ -54,6 +54,7 @@ def test_a_role_process_puts_message_faults_before_its_core(tmp_path: Path) -> N
         board=board.path,
         counter=board.new_counter(),
         receiver="vehicle",
+        names=("v1",),
         seed="1/agent-v1/1",
     )
     core = _Silent()

@@ -13,7 +13,7 @@ from laneweave.protocol.runtime.message_faults import FaultyCore, MessageRule
 from laneweave.protocol.runtime.metrics import RouterMetrics
 from laneweave.protocol.runtime.transport import LinkDown, LinkUp
 from laneweave.protocol.wire import topics
-from laneweave.protocol.wire.messages import Heartbeat, Name, RoadClock
+from laneweave.protocol.wire.messages import Ballot, Heartbeat, Name, Prepare, RoadClock
 from laneweave.protocol.wire.process_messages import LogEvent, Report
 from support.node_recorder import Recorder, at_start, beat
 from support.refusals import refusal
@@ -140,6 +140,82 @@ def test_a_rule_is_for_its_topics() -> None:
     assert listener.numbers == [2]
 
 
+V1, C1, BRIDGE = ("vehicle", "v1"), ("coordinator", "c1"), ("bridge", "bridge")
+PROMISE = Prepare(Ballot(1, Name("c1"), 1, 1), (), ())
+
+
+@pytest.mark.parametrize(
+    ("topic", "parameters", "message", "sender"),
+    [
+        (topics.STATE, {"block": "1", "vehicle": "v1"}, None, V1),
+        (topics.COMMAND, {"vehicle": "v1"}, None, V1),
+        (topics.HEARTBEAT, {"coordinator": "c1"}, None, C1),
+        (topics.PREPARE, {"vehicle": "v9"}, PROMISE, C1),
+        (topics.CLOCK, {}, None, BRIDGE),
+        (topics.SENSE, {"vehicle": "v9"}, None, BRIDGE),
+        (topics.REPORT, {"role": "agent", "name": "v1"}, None, V1),
+        (topics.EVENT, {"role": "coordinator", "name": "c1"}, None, C1),
+    ],
+)
+def test_a_rule_names_a_single_sender(
+    topic: topics.Topic,
+    parameters: dict[str, str],
+    message: Prepare | None,
+    sender: tuple[str, str],
+) -> None:
+    event = node.Arrived(topic, parameters, message or beat(1).message)
+    for named in ("v1", "v2", "c1", "c2", "vehicle", "coordinator", "bridge"):
+        core, listener = faulty(MessageRule(loss=1.0, sender=named))
+        feed(core, event)
+        assert (listener.events == []) is (named in sender), named
+
+
+def process(kind: str, names: tuple[str, ...], *rules: MessageRule) -> tuple[FaultyCore, Recorder]:
+    listener = Recorder()
+    return FaultyCore(listener, rules, Board(), receiver=kind, seed="1", names=names), listener
+
+
+def test_a_rule_names_a_single_receiver() -> None:
+    rule = MessageRule(loss=1.0, receiver="v1")
+    for kind, name in (("vehicle", "v1"), ("vehicle", "v2"), ("coordinator", "c1")):
+        core, listener = process(kind, (name,), rule)
+        feed(core, arrived(1, vehicle="v3"))
+        assert (listener.events == []) is (name == "v1"), name
+
+
+def test_of_several_vehicles_in_a_process_only_the_named_one_loses_what_is_sent_to_it() -> None:
+    core, listener = process("vehicle", ("v1", "v2"), MessageRule(loss=1.0, receiver="v1"))
+    feed(core, arrived(1, topics.SENSE, vehicle="v1"))
+    feed(core, arrived(2, topics.SENSE, vehicle="v2"))
+    assert listener.numbers == [2]
+    # The state of another vehicle has no address: the process receives it once, for both.
+    feed(core, arrived(3, vehicle="v3"))
+    assert listener.numbers == [2]
+
+
+def test_between_is_symmetrical() -> None:
+    rule = MessageRule(loss=1.0, between=("v1", "v2"))
+    for receiver, lost in (("v1", {"v2"}), ("v2", {"v1"}), ("v3", set())):
+        for sender in ("v1", "v2", "v3"):
+            core, listener = process("vehicle", (receiver,), rule)
+            feed(core, arrived(1, vehicle=sender))
+            assert (listener.events == []) is (sender in lost), (sender, receiver)
+
+
+def test_all_conditions_of_a_rule_must_hold() -> None:
+    rule = MessageRule(loss=1.0, topics=("motion",), sender="v2", receiver="v1", from_s=5.0)
+    lost = []
+    for topic in (topics.STATE, topics.MOTION):
+        for road_s in (4.0, 5.0):
+            board = Board(road_s)
+            listener = Recorder()
+            core = FaultyCore(listener, (rule,), board, receiver="vehicle", seed="1", names=("v1",))
+            feed(core, arrived(1, topic, vehicle="v2"))
+            if not listener.events:
+                lost.append((topic.name, road_s))
+    assert lost == [("motion", 5.0)]
+
+
 @pytest.mark.parametrize(
     ("topic", "parameters", "sender"),
     [
@@ -254,8 +330,11 @@ def test_the_clock_of_the_bridge_sets_the_road_time() -> None:
         ({"jitter_s": 61.0}, "jitter_s"),
         ({"topics": ("states",)}, "topics"),
         ({"topics": ("vehicle-alive",)}, "topics"),
-        ({"sender": "router"}, "sender"),
-        ({"receiver": "any"}, "receiver"),
+        ({"sender": "v 1"}, "sender"),
+        ({"receiver": ""}, "receiver"),
+        ({"between": ("v1", "v1")}, "between"),
+        ({"between": ("v1", "*")}, "between"),
+        ({"between": ("v1", "v2"), "sender": "c1"}, "between"),
         ({"from_s": 5.0, "until_s": 5.0}, "until_s"),
     ],
 )

@@ -11,7 +11,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.wire.identities import Incarnations, above, parse_identity
+from laneweave.protocol.wire.identities import (
+    Incarnations,
+    above,
+    parse_identity,
+    process_id_of,
+)
 from support.refusals import refusal
 from support.tables import for_each
 
@@ -112,3 +117,9 @@ def test_any_text_is_an_identity_or_refused(text: str) -> None:
         return
     assert identity.common_name == text
     assert len(text) <= 64
+
+
+def test_an_incarnation_contains_the_process_id() -> None:
+    incarnation = Incarnations()()
+    assert process_id_of(incarnation) == os.getpid()
+    assert process_id_of(above(incarnation, incarnation + 10 * STEP)) == os.getpid()

@@ -25,6 +25,7 @@ from laneweave.protocol.wire.process_messages import LogEvent, Report
 from laneweave.sim_bridge.bodies.motion_controller import FallbackLevel
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import MinGaps
 from laneweave.sim_bridge.recording.columns import SCENARIO_KEY
+from laneweave.sim_bridge.recording.events import append_event
 from laneweave.sim_bridge.recording.run_record import RunRecord
 from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.road.entry import Admission
@@ -68,8 +69,9 @@ def test_the_summary_contains_how_the_run_ended(
     record.close(12.0, ending)
     assert read_summary(tmp_path)["ending"] == ending.value
     assert read_summary(tmp_path)["simulated_s"] == 12.0
-    (event,) = read_events(tmp_path, "run-ended")
-    assert (event["ending"], event["t_s"]) == (ending.value, 12.0)
+    events = [(event["ending"], event["t_s"]) for event in read_events(tmp_path, "run-ended")]
+    # A killed process reports no end.
+    assert events == [(ending.value, 12.0)] * (ending is not Ending.UNFINISHED)
 
 
 def test_the_first_ending_counts_and_nothing_follows_it(record: RunRecord, tmp_path: Path) -> None:
@@ -325,6 +327,17 @@ def test_events_are_written_at_once_and_begin_with_the_time(
     record.event(2.0, "odd", t_s=99, kind="other", more=[1, 2])
     (odd,) = read_events(tmp_path, "odd")
     assert odd == {"t_s": 2.0, "kind": "odd", "role": "bridge", "more": [1, 2]}
+
+
+def test_the_launcher_adds_events_between_those_of_the_bridge(
+    record: RunRecord, tmp_path: Path
+) -> None:
+    record.event(1.0, "odd")
+    append_event(tmp_path / "events.jsonl", 1.5, "fault-injected", {"role": "launcher"})
+    record.event(2.0, "odd")
+    lines = (tmp_path / "events.jsonl").read_text().splitlines()
+    found = [(one["t_s"], one["role"]) for one in map(json.loads, lines)]
+    assert found == [(1.0, "bridge"), (1.5, "launcher"), (2.0, "bridge")]
 
 
 # --- while it goes on -------------------------------------------------------------------------

@@ -1,0 +1,36 @@
+"""Appending to a file that other processes append to."""
+
+from __future__ import annotations
+
+import signal
+from pathlib import Path
+from resource import RLIM_INFINITY, RLIMIT_FSIZE, setrlimit
+
+import pytest
+
+from laneweave.protocol.files import append
+
+
+def test_two_writers_append_in_turn(tmp_path: Path) -> None:
+    path = tmp_path / "lines"
+    with path.open("ab", buffering=0) as one, path.open("ab", buffering=0) as other:
+        append(one, b"1\n")
+        append(other, b"2\n")
+        append(one, b"3\n")
+    assert path.read_bytes() == b"1\n2\n3\n"
+
+
+def test_a_line_that_does_not_fit_on_the_disk_is_not_there_in_part(tmp_path: Path) -> None:
+    path = tmp_path / "lines"
+    before = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    try:
+        with path.open("ab", buffering=0) as file:
+            append(file, b"first\n")
+            setrlimit(RLIMIT_FSIZE, (8, RLIM_INFINITY))
+            with pytest.raises(OSError, match="No space left"):
+                append(file, b"second\n")
+            append(file, b"3\n")
+    finally:
+        setrlimit(RLIMIT_FSIZE, (RLIM_INFINITY, RLIM_INFINITY))
+        signal.signal(signal.SIGXFSZ, before)
+    assert path.read_bytes() == b"first\n3\n"
