@@ -133,7 +133,7 @@ def test_a_second_bridge_does_not_start_while_the_first_one_drives(deployment: D
     assert not (lab.folder / "second").exists()
     assert not deployment.findings()
 
-    # Whoever means it gets the road, and all are told.
+    # With the option it does, and the finding says so.
     taken = lab.start("bridge", "--config", config, "--takeover", "--out", "taken")
     deployment.running["second"] = taken
     deployment.wait_for(partial(blames, "bridge"))
@@ -144,9 +144,9 @@ def test_a_second_bridge_does_not_start_while_the_first_one_drives(deployment: D
 def test_a_file_is_compared_with_a_bridge_before_a_role_starts(deployment: Deployment) -> None:
     lab, config = deployment.lab, deployment.config
     check = ("config", "check", config, "--against", "findings")
-    nobody = lab.run_forked(*check, alone=False)
-    assert nobody.status == 1
-    assert nobody.complaints[0].startswith("no bridge found in realm findings at ")
+    absent = lab.run_forked(*check, alone=False)
+    assert absent.status == 1
+    assert absent.complaints[0].startswith("no bridge found in realm findings at ")
     deployment.start("bridge")
     deployment.wait_for(lambda found: ("no-bridge", "bridge") not in found)
     fits = lab.run_forked(*check, alone=False)

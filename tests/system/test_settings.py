@@ -1,4 +1,4 @@
-"""Roles with different files: who does not fit does not act, and says what differs."""
+"""Roles with different files: those that do not fit do not act, and say what differs."""
 
 from __future__ import annotations
 
@@ -141,7 +141,7 @@ def test_vehicles_of_a_fleet_that_does_not_fit_are_driven_around(lab: Lab) -> No
     assert found["safety"]["overlaps"] == found["safety"]["emergency_brakes"] == 0
     assert found["safety"]["min_gap_m"] > 5.0
     assert found["vehicles"]["left"] == found["vehicles"]["demanded"]
-    # Nobody waits for agents that no process starts: all drive on without them.
+    # The road does not wait for agents that no process starts.
     assert found["runtime"]["tick_ms"]["p99"] < 1000.0
     (refused,) = events(lab.folder / "out", "settings-refused")
     assert refused["process"] == "fleet 1-of-2"

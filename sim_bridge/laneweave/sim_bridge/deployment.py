@@ -152,7 +152,8 @@ class Deployment:
             except BadInputError:
                 return
             self._has_fleets = True
-            self._fleets[_key(parameters)] = shard
+            if len(self._fleets) < MAX_REFUSED:
+                self._fleets[_key(parameters)] = shard
             if len(self._known_shards) < MAX_REFUSED or parameters["name"] in self._known_shards:
                 self._known_shards[parameters["name"]] = shard
 

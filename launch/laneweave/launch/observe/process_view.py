@@ -1,4 +1,4 @@
-"""Observed processes of a deployment: who is there, with which settings, and what the bridge says.
+"""Observed processes of a deployment: tokens, settings, and what the bridge says about its road.
 
 For observers; `road_view` has the road and its coordinators.
 """

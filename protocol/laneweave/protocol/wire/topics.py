@@ -183,7 +183,7 @@ SETTINGS = Topic(
     long=True,
     remark="all but observers: only while a process does not fit",
 )  # fmt: skip
-# Every process that acts on the road: who it is, and digests of the settings that all must share.
+# Every process that acts on the road, with digests of the settings that all must share.
 PROCESS_ALIVE = Topic(
     "process-alive", "alive/process/{role}/{name}/{incarnation}/{drives}/{digests}", None,
     ANY_SENDER, Quality.ASSURED,

@@ -114,7 +114,7 @@ def test_no_message_is_acted_on_before_the_comparison_but_those_of_the_release_b
     assert inner.seen[-1] == message(0)
 
 
-def test_who_does_not_fit_is_hidden_and_says_what_differs() -> None:
+def test_a_process_that_does_not_fit_is_hidden_and_says_what_differs() -> None:
     inner = Inner()
     core = make(inner)
     list(core.handle(Started(), 0.0))
@@ -148,7 +148,7 @@ def test_only_the_groups_that_a_core_uses_must_agree() -> None:
         assert (message(11) in inner.seen) == fits
 
 
-def test_a_forged_token_of_a_bridge_excludes_nobody_who_fits() -> None:
+def test_a_forged_token_of_a_bridge_excludes_no_process_that_fits() -> None:
     forged = process_token(FITS) | {"digests": OTHER.digests}
     for tokens in ((forged, process_token(FITS)), (process_token(FITS), forged)):
         inner = Inner()
