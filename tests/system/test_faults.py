@@ -10,6 +10,7 @@ from typing import Any
 import psutil
 import pytest
 
+from laneweave.protocol.scenario.deployment_fields import Shard
 from support.deployments import ask, deployment, free_tcp, start_router, stop
 from support.harness import (
     DEMAND,
@@ -336,8 +337,9 @@ def test_faults_of_a_deployment_by_hand(lab: Lab) -> None:
     router = start_router(lab, config)
     one, two = (lab.start("coordinator", "--config", config, "--name", c) for c in ("c1", "c2"))
     stranger = lab.start("coordinator", "--config", other, "--name", "c3")
-    killed = lab.start("agent", "--config", config, "v0002")
-    rest = lab.start("agent", "--config", config, "--shard", "0/1")
+    agents = [lab.start("agent", "--config", config, "--shard", f"{i}/2") for i in range(2)]
+    index = int(Shard(1, 2).contains("v0002"))
+    killed, rest = agents[index], agents[1 - index]
     lab.wait_until(lambda: ask(lab, config, request()).status == 0, END_S)
     command = lab.start("faults", "apply", faults, "--config", config)
     bridge = lab.start("bridge", "--config", config, "--pace", "3", "--out", "out")
@@ -361,7 +363,7 @@ def test_faults_of_a_deployment_by_hand(lab: Lab) -> None:
     ]
     assert set(done[1:3]) == {
         f"pause[0]: c1 (process {one.pid}) resumed",
-        f"kill[1]: agent-v0002 (process {killed.pid}) killed",
+        f"kill[1]: fleet-{index}-of-2 (process {killed.pid}) killed",
     }
     lab.wait_until(lambda: len(events(lab.folder / "out", "fault-injected")) == len(done), END_S)
     bridge.send_signal(signal.SIGTERM)

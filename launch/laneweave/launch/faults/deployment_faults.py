@@ -106,7 +106,8 @@ class DeploymentRoles:
         # Any name belongs to some shard, also one that is not the name of a vehicle.
         if vehicle not in vehicles:
             return None
-        processes = self._processes.items()
+        # Of several agents of a vehicle, the one that was started last is in charge.
+        processes = reversed(self._processes.items())
         return next((name for name, process in processes if process.drives(vehicle)), None)
 
     def kill(self, name: str) -> None:
