@@ -17,6 +17,10 @@ if TYPE_CHECKING:
     from laneweave.protocol.summary import RunSummary
 
 
+class BrokenRunError(AssertionError):
+    """A run has failed or broken a promise; the message has all problems, and its folder."""
+
+
 class LaneweaveRun(Protocol):
     """Runs a scenario; the test fails if the run does, or breaks a promise."""
 
@@ -40,6 +44,7 @@ class LaneweaveRun(Protocol):
 
         Raises:
             BadInputError: an argument or a value of the scenario is invalid.
+            BrokenRunError: the run has failed or broken a promise.
         """
 
 
@@ -59,6 +64,7 @@ def laneweave_run(tmp_path: Path) -> LaneweaveRun:
         transport: Transport | None = None,
         **overrides: Any,  # noqa: ANN401 (any field of a scenario)
     ) -> RunSummary:
+        __tracebackhide__ = True
         out = tmp_path / f"run-{next(numbers)}"
         if transport is None and method == "formation":
             transport = "simulated"
@@ -73,6 +79,6 @@ def laneweave_run(tmp_path: Path) -> LaneweaveRun:
             )
         except RunFailedError as error:
             broken = "\n".join(error.problems)
-        pytest.fail(f"{broken}\nfiles of the run: {out}", pytrace=False)
+        raise BrokenRunError(f"{broken}\nfiles of the run: {out}")
 
     return run_scenario

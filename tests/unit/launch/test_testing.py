@@ -31,7 +31,7 @@ def pytest_of(folder: Path, text: str) -> subprocess.CompletedProcess[str]:
 @pytest.mark.slow
 def test_the_example_of_the_guide_passes(tmp_path: Path) -> None:
     guide = (ROOT / "docs" / "FAULTS.md").read_text(encoding="utf-8")
-    (example,) = re.findall(r"```python\n(import laneweave\n.*?)```", guide, re.DOTALL)
+    (example,) = re.findall(r"```python\n(import pytest\n.*?)```", guide, re.DOTALL)
     ended = pytest_of(tmp_path, example)
     assert ended.returncode == 0, ended.stdout + ended.stderr
 

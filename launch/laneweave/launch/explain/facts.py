@@ -196,8 +196,20 @@ def _add(facts: Facts, event: Event) -> None:
         facts.refused.append(event)
     elif kind in (kinds.STREAM_PLANNED, kinds.PLANNING_FAILED, kinds.PLANNING_LATE):
         _add_slot(facts, event)
-    elif kind in _OF_SEVERAL and facts.vehicle in event[_OF_SEVERAL[kind]]:
+    elif _is_around(facts.vehicle, event):
         facts.events.append(event)
+
+
+def _is_around(vehicle: str, event: Event) -> bool:
+    """Return whether an event concerns a vehicle among others.
+
+    Faults do, but for those of the agents of other vehicles alone.
+    """
+    kind = event["kind"]
+    if kind == kinds.FAULT_INJECTED:
+        target = str(event["target"])
+        return not target.startswith("agent-") or vehicle in target
+    return kind in _OF_SEVERAL and vehicle in event[_OF_SEVERAL[kind]]
 
 
 def _add_own(facts: Facts, event: Event) -> None:

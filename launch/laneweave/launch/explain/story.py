@@ -126,6 +126,10 @@ def _refused_settings(event: Event) -> str:
     return f"{event['process']} refused: other settings ({', '.join(event['settings'])})"
 
 
+def _fault(event: Event) -> str:
+    return f"fault injected ({event['fault']}): {event['target']} {event['action']}"
+
+
 def _caretaker(event: Event) -> str:
     return f"caretaker in charge: {ABSENCE[event['reason']]}"
 
@@ -159,6 +163,7 @@ _TEXTS: Mapping[str, Callable[[Event], str]] = {
     kinds.STRUCTURE_IMPOSSIBLE: lambda _: "the formation does not fit into a driving structure",
     kinds.TRANSFER_ABORTED: lambda event: f"cell transfer aborted: {event['why']}",
     kinds.SETTINGS_REFUSED: _refused_settings,
+    kinds.FAULT_INJECTED: _fault,
     kinds.AGENT_MISSING: lambda _: "its agent has not started in time",
     kinds.AGENT_SILENT: lambda _: "its agent has stopped answering",
     kinds.CARETAKER_TOOK_OVER: _caretaker,
