@@ -30,15 +30,12 @@ coordinators = 2
 """
 OTHER_VALUES = {
     "formation.gap_m": ("fleet", "[formation]\ngap_m = 20.0"),
-    "formation.speed_mps": ("fleet", "[formation]\nspeed_mps = 13.0"),
     "road.lane_width_m": ("fleet", "[road]\nlane_width_m = 5.0"),
-    "vehicle.max_accel_mps2": ("fleet", "[vehicle]\nmax_accel_mps2 = 4.0"),
     "formation.close": (
         "coordinator",
         '[formation]\nclose = "columns"\nentry = "interlaced"',
     ),
     "formation.operation": ("coordinator", '[formation]\noperation = "rolling"'),
-    "road.lanes": ("coordinator", "[road]\nlanes = 4"),
 }
 """A setting, the role whose file has another value, and its file's lines."""
 
