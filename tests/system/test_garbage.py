@@ -73,7 +73,7 @@ def keys_of(topic: Topic, vehicle: str) -> Iterator[str]:
     """Return keys of a topic: of somebody who is there and of somebody who is not."""
     there = {"vehicle": vehicle, "block": 0, "stretch": 0, "coordinator": "c1"}
     there |= {"role": "agent", "name": vehicle, "incarnation": 1}
-    there |= {"session": "s1", "client": "client"}
+    there |= {"session": "s1", "client": "client", "drives": "0-of-1", "digests": "0-0-0-0"}
     nobody = dict.fromkeys(topic.parameters, "ghost") | {"block": 99, "stretch": 99}
     yield KEYS.key(topic, **there)
     yield KEYS.key(topic, **nobody)
@@ -97,7 +97,6 @@ def nonsense(topic: Topic, rng: random.Random) -> Iterator[bytes]:
         yield whole + b"\x00"
         body = list(to_builtins(message, builtin_types=(bytes,)))
         yield msgpack.packb([VERSION + 1, kind.__name__, body])
-        yield msgpack.packb([VERSION, kind.__name__, [*body, 1]])
         yield msgpack.packb([VERSION, kind.__name__, []])
         yield msgpack.packb([VERSION, kind.__name__, [float("nan")] * len(body)])
         yield msgpack.packb([VERSION, kind.__name__, [2**64 - 1] * len(body)])

@@ -179,7 +179,7 @@ def test_metrics_of_a_coordinator(lab: Lab) -> None:
     assert (ended.status, ended.out) == (0, "")
     entries = [json.loads(line) for line in ended.err.splitlines()]
     news = [entry["event"] for entry in entries if entry["level"] == "info"]
-    assert news == ["starting", "leader-elected", "stopping"]
+    assert news == ["starting", "leader-elected", "stopping", "leader-stepped-down"]
     assert not [entry for entry in entries if entry["level"] == "error"]
     assert {(entry["role"], entry["name"]) for entry in entries} == {("coordinator", "c1")}
     stop(lab, router)
