@@ -14,14 +14,14 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable
-from functools import lru_cache
+from functools import cache, lru_cache
 from types import NoneType, UnionType
 from typing import Any, get_args, get_origin, get_type_hints
 
 import msgpack
 from msgspec import Raw, Struct, ValidationError, convert
 from msgspec.msgpack import Decoder, Encoder
-from msgspec.structs import fields
+from msgspec.structs import FieldInfo, fields
 
 from laneweave.protocol.errors import NO_VALUE, BadInputError
 from laneweave.protocol.names import NAME_RULE
@@ -117,14 +117,18 @@ def remembering_decode(on_skipped: Callable[[int], None]) -> Callable[[bytes, ty
     return read_or_recall
 
 
+@cache
+def _fields(kind: type[Struct]) -> tuple[FieldInfo, ...]:
+    return fields(kind)
+
+
 def _known(value: Any, hint: Any) -> tuple[Any, int]:  # noqa: ANN401 (annotations have no type)
     """Return a part of a message without fields that its class does not have, and their number."""
     hint = next((one for one in _options(hint) if one is not NoneType), hint)
     if isinstance(hint, type) and issubclass(hint, Struct) and isinstance(value, list):
-        names = [one.name for one in fields(hint)]
-        hints = get_type_hints(hint, include_extras=True)
-        pairs = [_known(item, hints[name]) for name, item in zip(names, value, strict=False)]
-        skipped = max(0, len(value) - len(names))
+        known = _fields(hint)
+        pairs = [_known(item, one.type) for one, item in zip(known, value, strict=False)]
+        skipped = max(0, len(value) - len(known))
     elif get_args(hint)[1:] == (Ellipsis,) and isinstance(value, list):
         pairs, skipped = [_known(item, get_args(hint)[0]) for item in value], 0
     elif get_origin(hint) is dict and isinstance(value, dict):
@@ -162,7 +166,7 @@ def _refusal(payload: bytes, expected: type | None, problem: str) -> BadInputErr
     field, value, hint = _part(kind, body, match["path"] or "")
     lacking = _LENGTH.match(problem.removeprefix("Expected "))
     if lacking is not None and isinstance(hint, type) and issubclass(hint, Struct):
-        missing = fields(hint)[int(lacking[1])].name
+        missing = _fields(hint)[int(lacking[1])].name
         return BadInputError(f"{field}.{missing}", NO_VALUE, "a value; this field is required")
     allowed = match["allowed"]
     for type_name, words in _IN_WORDS.items():
