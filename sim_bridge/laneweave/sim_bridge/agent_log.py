@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
-from itertools import islice
 
 import structlog
 from attrs import define, field
 
-from laneweave.protocol.wire.messages import Name
+from laneweave.protocol.names import Name, first_names
 
 log = structlog.get_logger(__name__)
 
@@ -27,7 +26,7 @@ class AgentLog:
     fleet_of: Callable[[str], str]
     """Returns the fleet that drives a vehicle; empty: none is known."""
     _without: frozenset[Name] = frozenset()
-    """Vehicles without agents at the last call."""
+    """Vehicles without agents at the last update."""
     _waiting: dict[tuple[str, str], tuple[float, float, list[Name]]] = field(factory=dict)
     """When each line was begun, when it is due, and its vehicles, by change and fleet."""
     _logged_s: dict[tuple[str, str], float] = field(factory=dict)
@@ -72,13 +71,6 @@ class AgentLog:
                 change,
                 **({"fleet": fleet} if fleet else {}),
                 count=len(vehicles),
-                vehicles=_names(vehicles),
+                vehicles=first_names(vehicles, MAX_NAMES),
                 road_s=round(begun_s, 3),
             )
-
-
-def _names(vehicles: Collection[Name]) -> str:
-    """Return the first names, and how many others there are."""
-    more = len(vehicles) - MAX_NAMES
-    named = ", ".join(islice(vehicles, MAX_NAMES))
-    return f"{named} and {more} more" if more > 0 else named

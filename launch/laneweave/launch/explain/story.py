@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Mapping
-from itertools import groupby, islice
+from itertools import groupby
 from typing import Any
 
 from attrs import frozen
 
 from laneweave.launch.explain.facts import LEADER_LOST, Event, Facts
+from laneweave.protocol.names import first_names
 from laneweave.protocol.road_layout import ANY_LANE, END_OF_ROAD
 from laneweave.protocol.wire import events as kinds
 
@@ -28,9 +29,7 @@ class StoryLine:
 
 def names(vehicles: Collection[str]) -> str:
     """Return the names of vehicles, the first ones if they are many."""
-    more = len(vehicles) - MAX_NAMES
-    named = ", ".join(islice(vehicles, MAX_NAMES))
-    return f"{named} and {more} more" if more > 0 else named
+    return first_names(vehicles, MAX_NAMES)
 
 
 def seconds(t_s: float) -> str:
