@@ -198,7 +198,7 @@ class FormationPlanner:
         yield from self._begin()
 
     def _too_late(self, leader: FormationLeader, cells: Collection[Cell]) -> dict[str, object]:
-        """Return who does not sort its lane because it is too late for any step, and why.
+        """Return which vehicles do not sort their lanes, as it is too late for any step, and why.
 
         Args:
             leader: leader of the formation.
@@ -211,12 +211,10 @@ class FormationPlanner:
             if formation.sorts and cell[1] not in goals[name]
         ]
         closed_s, since_s = formation.closed_s, self.leading_since_s or 0.0
+        slot_s = self._scenario.timing.cycles_s[0]
 
         def was_too_late(t_s: float) -> bool:
-            start_s, slot_s = (
-                self._start_s(formation, cells, t_s),
-                self._scenario.timing.cycles_s[0],
-            )
+            start_s = self._start_s(formation, cells, t_s)
             return steps_left(cells, start_s, slot_s, self._scenario) == 0
 
         if was_too_late(closed_s):

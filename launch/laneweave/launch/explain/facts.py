@@ -26,7 +26,7 @@ _OF_VEHICLE = frozenset(
         kinds.COMMAND_REFUSED,
     )
 )
-"""Kinds of events about one vehicle, but for changes of who is in charge of it."""
+"""Kinds of events about one vehicle, but for changes of the process in charge."""
 _OF_FORMATION = frozenset(
     (
         kinds.PLAN_MADE,
@@ -252,7 +252,7 @@ def _add_formation(facts: Facts, event: Event) -> None:
     if event["kind"] == kinds.FORMATION_CLOSED:
         if facts.vehicle not in event["vehicles"]:
             return
-        # One that waited at the end of a lane is in another formation now.
+        # A vehicle that waited at the end of a lane joins a later formation.
         facts.formations, facts.members = {int(event["formation"])}, {*event["vehicles"]}
         facts.closed_s = float(event["t_s"])
         # Only now is it known that these vehicles matter.

@@ -124,7 +124,7 @@ class DeploymentRoles:
         self._paused.pop(name).send(signal.SIGCONT)
 
     def restart(self, name: str) -> None:
-        """Refuse, since only the one who has started a process can start it again.
+        """Refuse: only the program that started a process can start it again.
 
         Raises:
             CommandFailedError: always.

@@ -176,7 +176,7 @@ MEANINGS: Final[Mapping[str, str]] = {
     "leader_until_s": "road time of the last heartbeat of a leader before [s]; null: none",
     "occupant": "vehicle, or gap for one, that occupies a cell on the way",
     "excess_m": "how far the command would have led the body out of its cells [m]",
-    "previous": "who was in charge before: caretaker or agent",
+    "previous": "which process was in charge before: caretaker or agent",
     "process": "role and name of the process that was refused",
     "incarnation": "incarnation of this process",
     "settings": "settings that differ: value of the bridge, value of the process",

@@ -1,7 +1,8 @@
 """Why vehicles leave the road in other lanes than their preferred ones, as far as a bridge knows.
 
-The bridge knows who is in charge of a vehicle, whether a coordinator leads, and what happens at the
-ends of lanes. Coordinators write in their own events why plans leave vehicles off their lanes.
+The bridge knows which process is in charge of a vehicle, whether a coordinator leads, and what
+happens at the ends of lanes. Coordinators write in their own events why plans leave vehicles off
+their lanes.
 """
 
 from __future__ import annotations
