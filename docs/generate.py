@@ -61,7 +61,7 @@ from laneweave.protocol.summary import described
 from laneweave.protocol.vehicle.execution_rules import VEHICLE_RULES
 from laneweave.protocol.vehicle.plan_execution import ExecutionPhase
 from laneweave.protocol.wire import events, messages, process_messages
-from laneweave.protocol.wire.common_settings import AGENT_GROUPS, GROUPS
+from laneweave.protocol.wire.common_settings import GROUPS, groups_of
 from laneweave.protocol.wire.identities import Identity
 from laneweave.protocol.wire.topics import TOPICS, Exchange, Party, Topic
 from laneweave.sim_bridge.core import BridgeMetrics
@@ -241,7 +241,7 @@ def _settings() -> str:
     lines = ["| group | settings | compared by |", "|---|---|---|"]
     lines += [
         f"| {group} | {', '.join(f'`{name}`' for name in names)} "
-        f"| {'all roles' if group in AGENT_GROUPS else 'coordinators'} |"
+        f"| {'all roles' if group in groups_of('agent') else 'coordinators'} |"
         for group, names in GROUPS.items()
     ]
     return "\n".join(lines)

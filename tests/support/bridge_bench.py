@@ -36,7 +36,6 @@ from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.transports.simulated.network import SimulatedNetwork
 from laneweave.protocol.transports.simulated.virtual_time import Conditions
 from laneweave.protocol.wire.codec import encode
-from laneweave.protocol.wire.common_settings import AGENT_GROUPS
 from laneweave.protocol.wire.identities import Identity
 from laneweave.protocol.wire.messages import (
     Command,
@@ -370,7 +369,7 @@ class Street:
     ) -> None:
         process = Process.of(identity, self._new_incarnation(), drives)
         settings = settings_of(scenario)
-        self._add(name, CheckedCore(core, process, settings, SENSE, AGENT_GROUPS))
+        self._add(name, CheckedCore(core, process, settings, SENSE))
 
     def _make_host(
         self, scenario: Scenario, vehicles: Sequence[Name] = (), shard: Shard | None = None

@@ -18,7 +18,6 @@ from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.security.connection import Access
 from laneweave.protocol.transports.zenoh.runner import run_core
 from laneweave.protocol.vehicle.motion import cell_state
-from laneweave.protocol.wire.common_settings import AGENT_GROUPS
 from laneweave.protocol.wire.identities import Incarnations, parse_identity
 from laneweave.protocol.wire.messages import CurrentMotion, Name, Sense, VehicleRecord
 from laneweave.protocol.wire.topics import SENSE
@@ -79,5 +78,5 @@ def run_agents(
     drives = "named" if shard is None else shard.name
     process = Process.of(parse_identity(access.identity), incarnation, drives)
     settings = settings_of(scenario)
-    core = CheckedCore(host, process, settings, SENSE, AGENT_GROUPS)
+    core = CheckedCore(host, process, settings, SENSE)
     run_core(wrap(core), access, observe=observe)

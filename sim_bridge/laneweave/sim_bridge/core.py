@@ -252,7 +252,7 @@ class BridgeCore:
         return effects
 
     def _status(self, now_s: float) -> RoadStatus:
-        """Return what observers learn about the road, but for the time without agents."""
+        """Return what observers learn about the road."""
         waits = self.phase is TickPhase.AGENTS
         up = self._answers.up
         return RoadStatus(
@@ -262,7 +262,7 @@ class BridgeCore:
             awaited=tuple(
                 one.name for one in self.road.at_entrance if waits and one.name not in up
             ),
-            unattended=dict.fromkeys(self.road.caretakers.vehicles, 0.0),
+            unattended=self._deployment.unattended(self.road.caretakers.vehicles, now_s),
             overlaps=self._record.overlap_count,
             recording=self._record.recording,
         )

@@ -1,17 +1,14 @@
 """The deployment as its bridge sees it: processes that do not fit, fleets that can answer.
 
-The bridge declares its settings (`scenario.common_settings`), with which other processes compare
+The bridge declares its settings (`wire.common_settings`), with which other processes compare
 theirs. At the entrance it waits for an agent only if a process is there that can start it.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 
-from msgspec.structs import replace
-
-from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.runtime.node import (
     Announce,
     Arrived,
@@ -26,13 +23,9 @@ from laneweave.protocol.runtime.node import (
 from laneweave.protocol.runtime.settings_check import PERIOD_S, Process
 from laneweave.protocol.runtime.transport import LinkUp
 from laneweave.protocol.scenario.common_settings import settings_of
-from laneweave.protocol.scenario.deployment_fields import Shard, parse_shard
+from laneweave.protocol.scenario.deployment_fields import Shard
 from laneweave.protocol.scenario.fields import Scenario
-from laneweave.protocol.wire.common_settings import (
-    AGENT_GROUPS,
-    GROUPS,
-    different_groups,
-)
+from laneweave.protocol.wire.common_settings import different_groups, groups_of
 from laneweave.protocol.wire.events import SETTINGS_REFUSED
 from laneweave.protocol.wire.identities import Identity
 from laneweave.protocol.wire.messages import Name
@@ -48,10 +41,9 @@ from laneweave.protocol.wire.topics import (
 from laneweave.sim_bridge.recording.record_interface import Record
 
 FLEET = ROLES[Party.FLEET]
-COORDINATOR = ROLES[Party.COORDINATOR]
-MAX_REFUSED = 1000
-"""Maximum number of processes that do not fit for which an event is recorded, and of fleets whose
-names are kept."""
+MAX_PROCESSES = 1000
+"""Maximum number of fleets that are remembered, and of processes that do not fit for which an event
+is recorded."""
 
 Key = tuple[str, str, str]
 """Role, name and incarnation of a process."""
@@ -81,7 +73,7 @@ class Deployment:
         processes of single vehicles."""
         self._refused: set[Key] = set()
         self._unattended_since_s: dict[Name, float] = {}
-        """When each vehicle was first published as without an agent."""
+        """When each vehicle was first seen without an agent."""
         self._publish_s = 0.0 if incarnation > 0 else math.inf
 
     # --- settings -----------------------------------------------------------------------------
@@ -100,13 +92,16 @@ class Deployment:
         return self._publish_s
 
     def publish(self, now_s: float, status: RoadStatus) -> Iterator[Effect]:
-        """Publish the settings, and a status with the times without agents."""
+        """Publish the settings and a status."""
         self._publish_s = now_s + PERIOD_S
-        since_s = self._unattended_since_s
-        self._unattended_since_s = {name: since_s.get(name, now_s) for name in status.unattended}
-        lasting = {name: now_s - at_s for name, at_s in self._unattended_since_s.items()}
         yield self._process.settings_effect(self._settings)
-        yield Send(ROAD_STATUS, replace(status, unattended=lasting))
+        yield Send(ROAD_STATUS, status)
+
+    def unattended(self, without: Iterable[Name], now_s: float) -> dict[Name, float]:
+        """Return for how long each of the vehicles without agents has been without one [s]."""
+        since_s = self._unattended_since_s
+        self._unattended_since_s = {name: since_s.get(name, now_s) for name in without}
+        return {name: now_s - at_s for name, at_s in self._unattended_since_s.items()}
 
     def on_event(self, event: Event, t_s: float, now_s: float) -> None:
         """Handle an event; ignore those that are not about other processes."""
@@ -130,9 +125,8 @@ class Deployment:
         key = other.role, other.name, str(other.incarnation)
         if other.role == self._process.role or key in self._refused:
             return
-        groups = GROUPS if other.role == COORDINATOR else AGENT_GROUPS
-        differences = self._settings.differences(other.values, groups)
-        if differences and len(self._refused) < MAX_REFUSED:
+        differences = self._settings.differences(other.values, groups_of(other.role))
+        if differences and len(self._refused) < MAX_PROCESSES:
             self._refused.add(key)
             self._record.event(
                 t_s,
@@ -145,17 +139,14 @@ class Deployment:
     # --- fleets -------------------------------------------------------------------------------
 
     def _on_fleet(self, parameters: Mapping[str, str]) -> None:
-        differing = different_groups(self._settings.digests, parameters["digests"])
-        if not differing or set(AGENT_GROUPS).isdisjoint(differing):
-            try:
-                shard = parse_shard(parameters["drives"].replace("-of-", "/"), "drives")
-            except BadInputError:
-                return
-            self._has_fleets = True
-            if len(self._fleets) < MAX_REFUSED:
-                self._fleets[_key(parameters)] = shard
-            if len(self._known_shards) < MAX_REFUSED or parameters["name"] in self._known_shards:
-                self._known_shards[parameters["name"]] = shard
+        shard, name = Shard.named(parameters["drives"]), parameters["name"]
+        if shard is None or different_groups(self._settings.digests, parameters["digests"], FLEET):
+            return
+        self._has_fleets = True
+        if len(self._fleets) < MAX_PROCESSES:
+            self._fleets[_key(parameters)] = shard
+        if len(self._known_shards) < MAX_PROCESSES or name in self._known_shards:
+            self._known_shards[name] = shard
 
     def _starters(self, vehicle: str) -> list[Key | None]:
         """Return the processes that can start a vehicle's agent; None: one that is not known."""

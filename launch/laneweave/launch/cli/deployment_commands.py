@@ -187,14 +187,15 @@ def _compare(settings: Scenario, realm: str, role: Party | None) -> int:
     from laneweave.protocol.errors import CommandFailedError, raise_all
     from laneweave.protocol.scenario.common_settings import settings_of
     from laneweave.protocol.security.access_control import access_of
-    from laneweave.protocol.wire.common_settings import AGENT_GROUPS, GROUPS
+    from laneweave.protocol.wire.common_settings import GROUPS, groups_of
+    from laneweave.protocol.wire.topics import ROLES
 
     network = attrs.evolve(settings.network, realm=realm)
     access = access_of(attrs.evolve(settings, network=network), "observer.status")
     bridge = settings_of_bridge(access)
     if bridge is None:
         raise CommandFailedError(f"no bridge found in realm {realm} at {access.endpoint}")
-    groups = AGENT_GROUPS if role in (Party.VEHICLE, Party.FLEET) else tuple(GROUPS)
+    groups = groups_of(ROLES[role]) if role in ROLES else tuple(GROUPS)
     own = settings_of(settings)
     raise_all(
         BadInputError(one.name, Described(one.own), f"{one.other}, as the bridge in realm {realm}")

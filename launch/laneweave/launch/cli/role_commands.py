@@ -13,7 +13,6 @@ from typing import Annotated
 
 import structlog
 import typer
-from attrs import evolve
 from rich.console import Console
 
 from laneweave.launch.cli.options import (
@@ -208,9 +207,7 @@ def watch(
 
     if folder is None:
         settings = load_deployment(config, endpoint, network__connect_timeout_s=wait)
-        expected = Expected.of(settings, bridge=True)
-        if config is None:
-            expected = evolve(expected, coordinators=())  # a default names none
+        expected = Expected.of(settings, bridge=True, default=config is None)
         watch_live(settings, listen, typer.echo, expected)
         return
     unused = {"config": config, "endpoint": endpoint, "wait": wait}

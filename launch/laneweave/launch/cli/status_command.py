@@ -10,7 +10,6 @@ from enum import StrEnum
 from typing import Annotated
 
 import typer
-from attrs import evolve
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
@@ -66,9 +65,8 @@ def status(
 ) -> None:
     """Listen to a deployment and print its state; exit with status 1 if it is unhealthy."""
     settings = load_deployment(config, endpoint, network__realm=realm)
-    process, expected = _expected(settings, role, name, shard, bridge=not no_bridge)
-    if process is None and config is None:
-        expected = evolve(expected, coordinators=())  # a default names none
+    everything = Expected.of(settings, bridge=not no_bridge, default=config is None)
+    process, expected = _expected(everything, role, name, shard)
     found = listen(settings, seconds, expected, process)
     if as_json:
         typer.echo(json.dumps(found.to_dict(), indent=2))
@@ -81,15 +79,15 @@ def status(
 
 
 def _expected(
-    settings: Scenario, role: Role | None, name: str | None, shard: str | None, *, bridge: bool
+    everything: Expected, role: Role | None, name: str | None, shard: str | None
 ) -> tuple[str | None, Expected]:
-    """Return the process to check, if it is only one, and what should be there."""
+    """Return the process to check, if it is only one, and what of `everything` should be there."""
     if shard is not None:
         if role is not Role.agent or name is not None:
             raise BadInputError("--shard", shard, "only with --role agent and without --name")
         part = parse_shard(shard, "--shard")
-        fleets = Expected.of(settings, bridge=False).fleets
-        fleet = next((one for one, members in fleets.items() if members == part), part.name)
+        fleets = everything.fleets.items()
+        fleet = next((one for one, members in fleets if members == part), part.name)
         return label_of(FLEET, fleet), Expected(fleets={fleet: part})
     if name is not None and (role in (None, Role.bridge) or not NAME_PATTERN.fullmatch(name)):
         raise BadInputError("--name", name, f"only with --role coordinator or agent: {NAME_RULE}")
@@ -104,7 +102,7 @@ def _expected(
         case Role.bridge:
             return BRIDGE, Expected(bridge=True)
         case None:
-            return None, Expected.of(settings, bridge=bridge)
+            return None, everything
 
 
 def listen(

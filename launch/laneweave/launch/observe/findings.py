@@ -17,13 +17,13 @@ from attrs import define, field, frozen
 from laneweave.launch.observe.observed import AGENT, BRIDGE, COORDINATOR, FLEET, Expected, Observed
 from laneweave.launch.observe.process_view import label_of
 from laneweave.launch.observe.road_view import RoadView, claims_of
+from laneweave.protocol.names import first_names
 from laneweave.protocol.runtime.metrics import metric
 from laneweave.protocol.wire.codec import VERSION
 from laneweave.protocol.wire.common_settings import (
-    AGENT_GROUPS,
-    GROUPS,
     CommonSettings,
     different_groups,
+    groups_of,
 )
 from laneweave.protocol.wire.messages import ClosedFormation
 from laneweave.protocol.wire.topics import Party
@@ -133,10 +133,7 @@ def _road_stands(observed: Observed) -> Found:
     status, clock = observed.status, observed.view.clock
     if status is None or clock is None or status.standing_s < STANDING_S:
         return
-    by_process: dict[str, list[str]] = {}
-    for vehicle in status.awaited:
-        by_process.setdefault(_starter(observed, vehicle), []).append(vehicle)
-    for process, vehicles in by_process.items():
+    for process, vehicles in _by_starter(observed, status.awaited).items():
         lasting = f"the road has stood at {clock.t_s:.1f} s for {status.standing_s:.0f} s"
         yield process, f"{lasting}, waiting for {_named(vehicles)}"
 
@@ -240,18 +237,20 @@ def _agent_missing(observed: Observed) -> Found:
 
 def _unattended(observed: Observed) -> Found:
     """Vehicles on the road have had no agent for 2 s or more."""
-    by_process: dict[str, dict[str, float]] = {}
-    for vehicle, for_s in observed.unattended().items():
-        if for_s >= UNATTENDED_S:
-            by_process.setdefault(_starter(observed, vehicle), {})[vehicle] = for_s
-    for process, vehicles in by_process.items():
+    for_s = {one: time_s for one, time_s in observed.unattended().items() if time_s >= UNATTENDED_S}
+    for process, vehicles in _by_starter(observed, for_s).items():
         count = len(vehicles)
         have = "vehicle has" if count == 1 else "vehicles have"
-        longest = max(vehicles, key=lambda one: vehicles[one])
-        yield (
-            process,
-            f"{count} {have} no agent, such as {longest} for {vehicles[longest]:.0f} s",
-        )
+        longest = max(vehicles, key=for_s.__getitem__)
+        yield process, f"{count} {have} no agent, such as {longest} for {for_s[longest]:.0f} s"
+
+
+def _by_starter(observed: Observed, vehicles: Iterable[str]) -> dict[str, list[str]]:
+    """Return vehicles by the process that starts their agents."""
+    grouped: dict[str, list[str]] = {}
+    for vehicle in vehicles:
+        grouped.setdefault(_starter(observed, vehicle), []).append(vehicle)
+    return grouped
 
 
 def _starter(observed: Observed, vehicle: str) -> str:
@@ -273,14 +272,13 @@ def _other_settings(observed: Observed) -> Found:
     for one in sorted(processes.tokens, key=lambda one: one.label):
         if one.role == BRIDGE:
             continue
-        used = tuple(GROUPS) if one.role == COORDINATOR else AGENT_GROUPS
-        groups = [name for name in different_groups(one.digests, bridge.digests) if name in used]
+        groups = different_groups(one.digests, bridge.digests, one.role)
         if not groups:
             continue
         own = processes.settings.get((one.role, one.name, one.incarnation))
         what = f"settings of {', '.join(groups)} differ from those of the bridge"
         if own is not None and values is not None:
-            found = CommonSettings(own.values).differences(values.values, used)
+            found = CommonSettings(own.values).differences(values.values, groups_of(one.role))
             what = "; ".join(str(each) for each in found[:MAX_NAMED]) or what
         yield one.label, f"{one.label} does not act on the road: {what}"
 
@@ -324,9 +322,8 @@ def _other_version(observed: Observed) -> Found:
 
 
 def _named(vehicles: list[str]) -> str:
-    shown, more = ", ".join(vehicles[:MAX_NAMED]), len(vehicles) - MAX_NAMED
     agents = "the agent of" if len(vehicles) == 1 else "the agents of"
-    return f"{agents} {shown}" + (f" and {more} more" if more > 0 else "")
+    return f"{agents} {first_names(vehicles, MAX_NAMED)}"
 
 
 RULES: Final = (

@@ -9,7 +9,6 @@ from attrs import field, frozen
 from laneweave.launch.observe.process_view import ProcessToken
 from laneweave.launch.observe.road_view import Coordinator, RoadView
 from laneweave.protocol.config.participants import coordinator_names
-from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.deployment_fields import Shard, parse_shard
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.wire.process_messages import RoadStatus
@@ -33,14 +32,20 @@ class Expected:
     """Vehicles whose agents should be there."""
 
     @classmethod
-    def of(cls, scenario: Scenario, *, bridge: bool) -> Expected:
-        """Return what a scenario expects; `bridge`: whether its road should be there."""
+    def of(cls, scenario: Scenario, *, bridge: bool, default: bool = False) -> Expected:
+        """Return what a scenario expects.
+
+        Args:
+            scenario: settings of the deployment.
+            bridge: whether its road should be there.
+            default: whether they are only default settings, which name no coordinators.
+        """
         fleets = {
             name: parse_shard(members, "security.fleets")
             for name, members in scenario.security.fleets.items()
             if isinstance(members, str)
         }
-        return cls(bridge, coordinator_names(scenario), fleets)
+        return cls(bridge, () if default else coordinator_names(scenario), fleets)
 
 
 NOTHING = Expected()
@@ -89,14 +94,9 @@ class Observed:
 
     def shards_present(self) -> dict[ProcessToken, Shard]:
         """Return the shards of the fleets with tokens."""
-        found = {}
-        for token in self.view.processes.tokens:
-            if token.role == FLEET and "-of-" in token.drives:
-                try:
-                    found[token] = parse_shard(token.drives.replace("-of-", "/"), "drives")
-                except BadInputError:
-                    continue  # forged
-        return found
+        fleets = (one for one in self.view.processes.tokens if one.role == FLEET)
+        shards = ((one, Shard.named(one.drives)) for one in fleets)
+        return {one: shard for one, shard in shards if shard is not None}
 
     def unattended(self) -> dict[str, float]:
         """Return for how long each vehicle on the road has been without an agent [s]."""

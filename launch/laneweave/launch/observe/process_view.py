@@ -39,7 +39,7 @@ class ProcessToken:
     drives: str
     """Vehicles whose agents it starts: the shard `I-of-N`, `named` ones, or `none`."""
     digests: str
-    """Digests of its settings; see `scenario.common_settings`."""
+    """Digests of its settings; see `wire.common_settings`."""
 
     @classmethod
     def of(cls, parameters: Mapping[str, str]) -> ProcessToken:

@@ -1,6 +1,6 @@
 """A core that acts only on roads whose settings it shares.
 
-Every process declares a token with the digests of its settings (`scenario.common_settings`). A
+Every process declares a token with the digests of its settings (`wire.common_settings`). A
 process whose digests differ from those of a bridge does not fit: `CheckedCore` hides this bridge
 from the wrapped core, as if it were not there, withdraws the core's tokens, and sends none of its
 messages. The process keeps running, since the next bridge may fit. It logs which settings differ,
@@ -9,7 +9,7 @@ and publishes its own, so that the bridge and observers can tell.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from typing import ClassVar
 
 import structlog
@@ -35,9 +35,9 @@ from laneweave.protocol.runtime.node import (
 )
 from laneweave.protocol.runtime.transport import LinkDown, LinkUp
 from laneweave.protocol.wire.common_settings import (
-    GROUPS,
     CommonSettings,
     different_groups,
+    groups_of,
 )
 from laneweave.protocol.wire.identities import Identity
 from laneweave.protocol.wire.messages import Name
@@ -111,12 +111,7 @@ class CheckedCore:
     """A `Core` from which roads with other settings are hidden."""
 
     def __init__(
-        self,
-        core: Core,
-        process: Process,
-        settings: CommonSettings,
-        acts_on: Topic,
-        groups: Iterable[str] = tuple(GROUPS),
+        self, core: Core, process: Process, settings: CommonSettings, acts_on: Topic
     ) -> None:
         """Wrap a core.
 
@@ -126,13 +121,11 @@ class CheckedCore:
             settings: settings of the process.
             acts_on: topic of the bridge's messages on which the core acts; it receives none from a
                 bridge until the settings have been compared.
-            groups: groups of settings that the core uses.
         """
         self.core = core
         self._process = process
         self._settings = settings
         self._acts_on = acts_on
-        self._groups = frozenset(groups)
         self._fits: dict[int, bool] = {}
         """Whether the settings of each known bridge fit, by incarnation."""
         self._heard_s: dict[int, float] = {}
@@ -247,9 +240,11 @@ class CheckedCore:
         if isinstance(event, PeerDown):
             self._tokens.discard(bridge)
         else:
-            differing = different_groups(self._settings.digests, event.parameters["digests"])
+            digests = self._settings.digests, event.parameters["digests"]
             # A forged token of the same bridge must not exclude a process that fits.
-            fits = self._groups.isdisjoint(differing) or self._fits.get(bridge, False)
+            fits = not different_groups(*digests, self._process.role) or self._fits.get(
+                bridge, False
+            )
             _make_room(self._fits)
             self._fits[bridge] = fits
             (self._tokens.discard if fits else self._tokens.add)(bridge)
@@ -284,7 +279,7 @@ class CheckedCore:
         bridge = other.incarnation
         if other.role != BRIDGE or bridge not in self._tokens or bridge in self._reported:
             return
-        differences = self._settings.differences(other.values, self._groups)
+        differences = self._settings.differences(other.values, groups_of(self._process.role))
         if differences:
             self._reported.add(bridge)
             log.error(

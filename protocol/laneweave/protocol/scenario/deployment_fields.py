@@ -39,6 +39,14 @@ class Shard:
         """Name of the shard in keys: `I-of-N`."""
         return f"{self.index}-of-{self.count}"
 
+    @classmethod
+    def named(cls, name: str) -> Shard | None:
+        """Return the shard with this `name`; None: it is not the name of a shard."""
+        try:
+            return parse_shard(name.replace("-of-", "/"), "drives")
+        except BadInputError:
+            return None
+
     def contains(self, vehicle: str) -> bool:
         """Return whether a vehicle belongs to this shard; all processes agree."""
         return zlib.crc32(vehicle.encode()) % self.count == self.index

@@ -19,6 +19,8 @@ from typing import Final
 
 from attrs import field, frozen
 
+from laneweave.protocol.wire.topics import ROLES, Party
+
 GROUPS: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
     {
         "road": (
@@ -66,8 +68,8 @@ GROUPS: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
 """Names of the settings by group, as in a scenario file. A table stands for all of its fields.
 
 All roles use the first three groups, only coordinators and the bridge the last one."""
-AGENT_GROUPS: Final = ("road", "lattice", "motion")
-"""Groups that agents use."""
+_AGENT_GROUPS: Final = ("road", "lattice", "motion")
+_FULL_ROLES: Final = (ROLES[Party.COORDINATOR], ROLES[Party.BRIDGE])
 MAX_SHOWN: Final = 80
 """Maximum number of characters of a value in a text."""
 
@@ -121,10 +123,15 @@ class CommonSettings:
         ]
 
 
-def different_groups(digests: str, others: str) -> list[str]:
-    """Return the groups whose digests differ."""
+def groups_of(role: str) -> tuple[str, ...]:
+    """Return the groups that the processes of a role use."""
+    return tuple(GROUPS) if role in _FULL_ROLES else _AGENT_GROUPS
+
+
+def different_groups(digests: str, others: str, role: str) -> list[str]:
+    """Return the groups that a role uses and whose digests differ."""
     pairs = zip_longest(GROUPS, digests.split("-"), others.split("-"))
-    return [group for group, one, other in pairs if group is not None and one != other]
+    return [group for group, one, other in pairs if one != other and group in groups_of(role)]
 
 
 def _of_group(values: Mapping[str, str], group: str) -> dict[str, str]:

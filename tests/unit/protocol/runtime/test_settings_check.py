@@ -27,7 +27,6 @@ from laneweave.protocol.runtime.node import (
 from laneweave.protocol.runtime.settings_check import WAIT_S, CheckedCore, Process, SettingsMetrics
 from laneweave.protocol.runtime.transport import LinkDown, LinkUp
 from laneweave.protocol.scenario.common_settings import settings_of
-from laneweave.protocol.wire.common_settings import AGENT_GROUPS, GROUPS
 from laneweave.protocol.wire.identities import Identity
 from laneweave.protocol.wire.messages import RoadClock
 from laneweave.protocol.wire.process_messages import ProcessSettings
@@ -81,9 +80,9 @@ def fits(core: CheckedCore) -> bool:
     return metrics.fit
 
 
-def make(inner: Inner, groups: Iterable[str] = tuple(GROUPS)) -> CheckedCore:
-    process = Process.of(Identity(Party.FLEET, "f"), 1, "0-of-1")
-    return CheckedCore(inner, process, OWN, CLOCK, groups)
+def make(inner: Inner, party: Party = Party.FLEET) -> CheckedCore:
+    process = Process.of(Identity(party, "f"), 1, "0-of-1")
+    return CheckedCore(inner, process, OWN, CLOCK)
 
 
 def message(bridge: int) -> Arrived:
@@ -137,12 +136,13 @@ def test_a_process_that_does_not_fit_is_hidden_and_says_what_differs() -> None:
     assert effects[:2] == [Unlisten(SETTINGS, {"role": "bridge"}), TOKEN]
 
 
-def test_only_the_groups_that_a_core_uses_must_agree() -> None:
+def test_only_the_groups_that_a_role_uses_must_agree() -> None:
     other = settings_of(parse_scenario({"formation": {"max_vehicles": 8}}))
     token = process_token(FITS) | {"digests": other.digests, "incarnation": "11"}
-    for groups, fits in ((AGENT_GROUPS, True), (tuple(GROUPS), False)):
+    roles = (Party.VEHICLE, True), (Party.FLEET, True), (Party.COORDINATOR, False)
+    for party, fits in roles:
         inner = Inner()
-        core = make(inner, groups)
+        core = make(inner, party)
         list(core.handle(PeerUp(PROCESS_ALIVE, token), 0.0))
         list(core.handle(message(11), 0.0))
         assert (message(11) in inner.seen) == fits
