@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from attrs import frozen
 
 from laneweave.protocol.lattice import Cell, PlannedMove
-from laneweave.protocol.runtime.node import Send
+from laneweave.protocol.runtime.node import Announce, Send
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.formation_table import FormationSettings
 from laneweave.protocol.wire.messages import (
@@ -21,10 +21,23 @@ from laneweave.protocol.wire.messages import (
     RoadClock,
     VehicleState,
 )
-from laneweave.protocol.wire.topics import CENSUS, CLOCK, HEARTBEAT, PLAN, STATE
+from laneweave.protocol.wire.topics import (
+    BRIDGE_ALIVE,
+    CENSUS,
+    CLOCK,
+    COORDINATOR_ALIVE,
+    HEARTBEAT,
+    PLAN,
+    STATE,
+)
 from support.states import holding, make_plan
 
 BALLOT = Ballot(3, Name("c1"), 17, 5)
+COORDINATORS = (
+    Heartbeat(Name("c1"), 17, 3, leading=True, plans=1),
+    Heartbeat(Name("c2"), 18, 3, leading=False, plans=0),
+    Heartbeat(Name("c3"), 19, 3, leading=False, plans=0),
+)
 ROLLING = Scenario(formation=FormationSettings(operation="rolling"))
 
 
@@ -35,6 +48,7 @@ class Convoy:
     count: int
     bridge: int = 1
     scenario: Scenario = ROLLING
+    coordinators: tuple[Heartbeat, ...] = COORDINATORS
 
     @property
     def names(self) -> list[Name]:
@@ -59,11 +73,18 @@ class Convoy:
             yield Send(CENSUS, self.census(tick))
         if tick % 40 == 0:
             yield Send(PLAN, self.plan(tick), {"vehicle": self.names[0]})
-        yield Send(HEARTBEAT, Heartbeat(Name("c1"), 17, 3, True, 1), {"coordinator": "c1"})
-        yield Send(HEARTBEAT, Heartbeat(Name("c2"), 18, 3, False, 0), {"coordinator": "c2"})
+        for one in self.coordinators:
+            yield Send(HEARTBEAT, one, {"coordinator": one.coordinator})
         for number in range(self.count):
             state = self.state(number, tick)
             yield Send(STATE, state, {"block": 0, "vehicle": state.vehicle})
+
+    def tokens(self) -> Iterator[Announce]:
+        """Yield the tokens of the road's processes."""
+        yield Announce(BRIDGE_ALIVE, {"incarnation": self.bridge})
+        for one in self.coordinators:
+            parameters = {"coordinator": one.coordinator, "incarnation": one.incarnation}
+            yield Announce(COORDINATOR_ALIVE, parameters)
 
     def clock(self, tick: int, *, ended: bool = False) -> RoadClock:
         """Return the clock of a tick."""

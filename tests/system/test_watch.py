@@ -29,7 +29,7 @@ from laneweave.protocol.transports.zenoh.transport import ZenohTransport
 from laneweave.protocol.wire.codec import encode
 from laneweave.protocol.wire.topics import Keys
 from support.chromium import Page, needs_chromium, new_page
-from support.convoy import Convoy
+from support.convoy import COORDINATORS, Convoy
 from support.deployments import REALM, deployment, free_tcp, start_router, stop
 from support.harness import DEMAND, END_S, RUN_S, Lab, summary
 from system.conftest import FinishedRun
@@ -83,6 +83,8 @@ class Traffic:
         with contextlib.closing(
             ZenohTransport(Access(self.endpoint, REALM), lambda _: None)
         ) as transport:
+            for token in self.convoy.tokens():
+                transport.announce(keys.key(token.topic, **token.parameters))
             due_s = time.monotonic()
             while not self._stop.is_set():
                 for send in self.convoy.messages(self.tick):
@@ -93,8 +95,7 @@ class Traffic:
                 self._stop.wait(max(0.0, due_s - time.monotonic()))
 
 
-def traffic(endpoint: str, count: int = VEHICLES, bridge: int = 1) -> Traffic:
-    convoy = Convoy(count, bridge)
+def traffic(endpoint: str, convoy: Convoy) -> Traffic:
     return Traffic(endpoint, convoy, convoy.first_tick)
 
 
@@ -127,7 +128,7 @@ def test_90_vehicles_are_shown(lab: Lab, page: Page) -> None:
     config = deployment(lab, endpoint)
     router = start_router(lab, config)
     watch, address = start_watch(lab, "--config", config)
-    with traffic(endpoint).flowing():
+    with traffic(endpoint, Convoy(VEHICLES)).flowing():
         page.open(address)
         page.wait_until(lambda: page.text("count") == str(VEHICLES))
 
@@ -137,8 +138,8 @@ def test_90_vehicles_are_shown(lab: Lab, page: Page) -> None:
             page.wait_until(partial(shown_since, page, before, count))
         assert page.run(FIRST_PAINT) > 0.0
         assert page.text("leader") == "c1, term 3"
-        assert page.text("candidates") == "c1c2"
-        assert page.text("pill") == "live"
+        assert page.text("candidates") == "c1c2c3"
+        page.wait_until(lambda: page.text("pill") == "live")
         _check_pause_and_slider(page)
     assert page.console_errors() == []
     stop(lab, watch, router)
@@ -167,8 +168,10 @@ def test_what_fails_is_shown_and_recovered_from(lab: Lab, page: Page) -> None:
     watch, address = start_watch(lab, "--endpoint", endpoint, "--config", config)
     page.open(address)
     page.wait_until(lambda: page.text("pill") == "no road")
-    assert health(address)[0] == 200
-    with traffic(endpoint, 6).flowing():
+    page.wait_until(lambda: page.text("banner").startswith("No bridge found: start the bridge"))
+    status, facts = health(address)
+    assert (status, facts["serving"]) == (503, True)
+    with traffic(endpoint, Convoy(6)).flowing():
         page.wait_until(lambda: page.text("pill") == "live")
         page.wait_until(lambda: page.text("count") == "6")
 
@@ -185,9 +188,15 @@ def test_what_fails_is_shown_and_recovered_from(lab: Lab, page: Page) -> None:
         assert health(address)[0] == 200
     page.wait_until(lambda: page.text("pill") == "clock stopped")
     # Another bridge is another road.
-    with traffic(endpoint, 4, bridge=2).flowing():
+    with traffic(endpoint, Convoy(4, bridge=2, coordinators=COORDINATORS[:2])).flowing():
         page.wait_until(lambda: page.text("count") == "4")
         page.wait_until(lambda: page.text("run").startswith("run 2"))
+        page.wait_until(lambda: page.text("pill") == "problem")
+        assert page.text("banner") == "No coordinator c3 found: start it."
+        page.click("pause")
+        page.wait_until(lambda: page.text("pill") == "paused")
+        page.click("pause")
+        page.wait_until(lambda: page.text("pill") == "problem")
 
     # An open page does not keep its server from ending.
     stop(lab, watch)

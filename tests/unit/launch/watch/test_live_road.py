@@ -212,13 +212,18 @@ def test_the_rolling_operation_has_no_formations() -> None:
 def test_leader_and_candidates() -> None:
     road = watched()
     frame = shown(road)
+    followers = [["c2", 3, False, False], ["c3", 3, False, False]]
     assert frame["leader"] == ["c1", 3]
-    assert frame["candidates"] == [["c1", 3, True, False], ["c2", 3, False, False]]
-    # A new leader; the old one is silent.
+    assert frame["candidates"] == [["c1", 3, True, False], *followers]
+    # A new leader; the others are silent.
     road.update(Heartbeat(Name("c2"), 18, 4, True, 0), 10.0)
     frame = shown(road, 10.1)
     assert frame["leader"] == ["c2", 4]
-    assert frame["candidates"] == [["c1", 3, False, True], ["c2", 4, True, False]]
+    assert frame["candidates"] == [
+        ["c1", 3, False, True],
+        ["c2", 4, True, False],
+        ["c3", 3, False, True],
+    ]
     # Later all are silent, and after a while they are forgotten.
     assert shown(road, 30.0)["leader"] is None
     assert shown(road, 100.0)["candidates"] == []

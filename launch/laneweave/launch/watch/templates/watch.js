@@ -387,12 +387,12 @@ class Watch {
       }[pill];
       const findings = frame.findings ?? [];
       if (findings.length > 0 && pill !== "lost" && pill !== "ended") {
-        pill = "problem";
+        if (pill === "live") pill = "problem";
         words = findings.map(([, what, advice]) => `${what}: ${advice}`).join("; ");
         words = `${words[0].toUpperCase()}${words.slice(1)}.`;
       }
     }
-    const paused = this.live && this.place !== null && pill === "live";
+    const paused = this.live && this.place !== null && (pill === "live" || pill === "problem");
     const shown = { waiting: "no road", lost: "connection lost", still: "clock stopped" }[pill];
     part("pill").textContent = paused ? "paused" : (shown ?? pill);
     part("pill").dataset.status = paused ? "paused" : pill;
