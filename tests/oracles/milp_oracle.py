@@ -22,7 +22,7 @@ from oracles.binary_programme import Row, cheapest_choice
 from oracles.path_rules import Cell, Move, Path, Problem
 
 PROGRAMME_LIMIT_S = 60.0
-"""A programme that takes longer is given up; few do."""
+"""A programme that takes longer is given up, unless asked otherwise; few do."""
 FORBIDDEN = 10_000
 """Distance to a target that a vehicle may not take or cannot reach."""
 
@@ -50,13 +50,17 @@ class Solution:
         }
 
 
-def optimal_cost(request: dict[str, Any], horizon: int | None = None) -> int | None:
+def optimal_cost(
+    request: dict[str, Any], horizon: int | None = None, limit_s: float = PROGRAMME_LIMIT_S
+) -> int | None:
     """The least cost over any number of steps; None: proven that there is no solution."""
-    solution = optimal_solution(request, horizon)
+    solution = optimal_solution(request, horizon, limit_s)
     return None if solution is None else solution.cost
 
 
-def optimal_solution(request: dict[str, Any], horizon: int | None = None) -> Solution | None:
+def optimal_solution(
+    request: dict[str, Any], horizon: int | None = None, limit_s: float = PROGRAMME_LIMIT_S
+) -> Solution | None:
     """A solution of least cost; `horizon` is only where the search for a proof begins."""
     problem = Problem.of(request)
     if any(moves is not None for moves in problem.drivable):
@@ -64,26 +68,35 @@ def optimal_solution(request: dict[str, Any], horizon: int | None = None) -> Sol
     distance = _distances(problem)
     if _matching_cost(distance) >= FORBIDDEN:
         return None
-    solution = _first_solution(problem, _bottleneck(distance) + 1 if horizon is None else horizon)
+    first = _bottleneck(distance) + 1 if horizon is None else horizon
+    solution = _first_solution(problem, first, limit_s)
     if solution is None:
         return None
     # Whoever arrives at a step later than this makes the whole cost no less than what is found.
     longest = solution.cost - 1 - _least_cost_of_the_others(distance)
     if longest <= solution.steps:
         return solution
-    cheaper = solve(problem, longest, longer_than=solution.steps, cheaper_than=solution.cost)
+    cheaper = solve(
+        problem,
+        longest,
+        longer_than=solution.steps,
+        cheaper_than=solution.cost,
+        limit_s=limit_s,
+    )
     return solution if cheaper is None else cheaper
 
 
-def _first_solution(problem: Problem, horizon: int) -> Solution | None:
+def _first_solution(problem: Problem, horizon: int, limit_s: float) -> Solution | None:
     """A solution that is optimal for some horizon; None: proven that there is no solution."""
     while True:
-        solution = solve(problem, horizon)
+        solution = solve(problem, horizon, limit_s=limit_s)
         if solution is not None:
             return solution
         if horizon > 2 * (problem.columns + problem.lanes):
             depth = fewest_steps(problem)
-            return None if depth is None else solve(problem, max(horizon, depth))
+            if depth is None:
+                return None
+            return solve(problem, max(horizon, depth), limit_s=limit_s)
         horizon += 3
 
 
@@ -312,10 +325,10 @@ class _Programme:
     def require_cost_below(self, cost: int) -> None:
         self.rows.append(([(x, 1.0) for x in self.move.values()], -np.inf, cost - 1.0))
 
-    def solve(self) -> Solution | None:
+    def solve(self, limit_s: float) -> Solution | None:
         if not self.costs:
             return None
-        result = cheapest_choice(self.costs, self.rows, PROGRAMME_LIMIT_S)
+        result = cheapest_choice(self.costs, self.rows, limit_s)
         if result.status == 2:
             return None
         if result.status != 0:
@@ -350,7 +363,12 @@ def _nearest(tables: list[dict[Cell, int]]) -> dict[Cell, int]:
 
 
 def solve(
-    problem: Problem, steps: int, *, longer_than: int | None = None, cheaper_than: int | None = None
+    problem: Problem,
+    steps: int,
+    *,
+    longer_than: int | None = None,
+    cheaper_than: int | None = None,
+    limit_s: float = PROGRAMME_LIMIT_S,
 ) -> Solution | None:
     """A cheapest solution in which all vehicles have arrived after `steps` steps.
 
@@ -362,7 +380,7 @@ def solve(
         programme.require_arrival_after(longer_than)
     if cheaper_than is not None:
         programme.require_cost_below(cheaper_than)
-    return programme.solve()
+    return programme.solve(limit_s)
 
 
 # ---------------------------------------------------------------------------- exhaustive search

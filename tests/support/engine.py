@@ -16,6 +16,7 @@ import subprocess
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from typing import Any
 
 from attrs import define, field, frozen
@@ -106,9 +107,9 @@ class Containers:
     services: dict[str, dict[str, Any]]
     project: str = field(factory=lambda: f"laneweave-test-{uuid.uuid4().hex[:8]}")
 
-    def up(self) -> None:
-        """Start all services; their images must exist."""
-        self._compose("up", "--detach", "--no-build", within_s=UP_S)
+    def up(self, *services: str) -> None:
+        """Start services and those that they depend on, or all; their images must exist."""
+        self._compose("up", "--detach", "--no-build", *services, within_s=UP_S)
 
     def down(self) -> None:
         """Remove all containers and volumes, also those of a project that did not start fully."""
@@ -160,7 +161,16 @@ class Containers:
     def wait_healthy(self, *services: str) -> None:
         """Wait until services are healthy."""
         for service in services:
-            wait_until(lambda name=service: self.healthy(name), READY_S)  # type: ignore[misc]
+            wait_until(partial(self.healthy, service), READY_S, lambda name=service: name)  # type: ignore[misc]
+
+    @contextmanager
+    def frozen(self, service: str) -> Iterator[None]:
+        """Stop the process of a service, which keeps its connections, and let it go on."""
+        self.execute(service, "sh", "-c", "kill -STOP -1")
+        try:
+            yield
+        finally:
+            self.execute(service, "sh", "-c", "kill -CONT -1")
 
     def kill(self, service: str) -> None:
         """Kill a service's process with SIGKILL and wait until the engine has restarted it."""

@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Callable, Iterator
+from functools import partial
 from itertools import product
 from typing import Any
 
@@ -39,6 +40,8 @@ CI_INSTANCES = 120
 LONG_INSTANCES = (27,)
 """Instances that TAPPA solves in 8 s; it solves most others in less than 0.1 s."""
 MORE_INSTANCES = 1_600
+MORE_LIMIT_S = 500.0
+"""The oracle takes 130 s for instance 424, on a machine that does nothing else."""
 FORMATION_INSTANCES = 100
 LARGE_INSTANCES = 100
 CLOSING_INSTANCES = 60
@@ -76,7 +79,8 @@ def test_planner_agrees_with_the_oracle_on_long_instances(oracle: Oracle) -> Non
 @pytest.mark.full
 @chunks(MORE_INSTANCES, first=INSTANCES)
 def test_planner_agrees_with_the_oracle_on_many_more(seeds: range) -> None:
-    assert_agreement(map(random_request, seeds), milp_oracle.optimal_cost)
+    oracle = partial(milp_oracle.optimal_cost, limit_s=MORE_LIMIT_S)
+    assert_agreement(map(random_request, seeds), oracle)
 
 
 FORMATIONS: tuple[tuple[Mode, tuple[str, ...]], ...] = (
