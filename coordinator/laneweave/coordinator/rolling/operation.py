@@ -118,8 +118,7 @@ class RollingOperation:
             return None
         transfer.on_state(state, self.observed.states, now_s)
         if transfer.phase is BallotPhase.ABORTED:
-            data = {"roster": list(transfer.roster), "why": transfer.reason}
-            return [LogEntry(TRANSFER_ABORTED, data)]
+            return [_aborted(transfer)]
         if transfer.phase is BallotPhase.IN_FORCE and self.in_force == 1:
             slot = math.floor(transfer.t0_s / self._slot_s + 1e-6)
             begun_s = (slot - 1) * self._slot_s
@@ -131,33 +130,42 @@ class RollingOperation:
     ) -> Iterator[Effect | LogEntry]:
         """Request the plan for the next slot when it is due; send messages."""
         if changed:
-            self.on_census(census)
+            yield from self.on_census(census)
             yield from self.order(t_s, now_s)
         for vehicle, message in self.outgoing(now_s):
             yield to_vehicle(vehicle, message)
 
-    def on_census(self, census: Census) -> None:
+    def on_census(self, census: Census) -> list[LogEntry]:
         """Update the vehicles on the road."""
+        aborted = []
         for name in self.observed.on_census(census):
             transfer = self._transfer_of.pop(name, None)
-            if transfer is not None:
+            if transfer is not None and transfer.unfinished:
                 transfer.on_left(name)
+                aborted.append(_aborted(transfer))
+        return aborted
+
+    def _abort(self, transfers: Iterable[CellTransfer], reason: str) -> Iterator[LogEntry]:
+        """Abort those of the ballots that are unfinished."""
+        for transfer in transfers:
+            if transfer.unfinished:
+                transfer.abort(reason)
+                yield _aborted(transfer)
 
     def outgoing(self, now_s: float) -> Iterator[tuple[Name, Prepare | Plan]]:
         """Yield the messages to send or resend now, each with its receiver."""
         for transfer in self.transfers:
             yield from transfer.outgoing(now_s)
 
-    def order(self, t_s: float, now_s: float) -> Iterator[Compute]:
-        """Request the plan for the next slot when it is due."""
+    def order(self, t_s: float, now_s: float) -> Iterator[Compute | LogEntry]:
+        """Request the plan for the next slot when it is due; abort ballots that are late."""
         census = self.observed.census
         if census is None:
             return
         if self._since is None:
             self._since = t_s, now_s
-        for transfer in self.transfers:
-            if t_s > transfer.t0_s + MAX_DELAY_S:
-                transfer.abort("its slot has begun")
+        late = [each for each in self.transfers if t_s > each.t0_s + MAX_DELAY_S]
+        yield from self._abort(late, "its slot has begun")
         if not census.on_road or self._ordered is not None:
             return
         slot = math.floor(t_s / self._slot_s + 1e-9)
@@ -184,8 +192,7 @@ class RollingOperation:
             return
         slot = self._ordered[1]
         self._ordered = None
-        for transfer in self.transfers:
-            transfer.abort("the next slot is planned")
+        yield from self._abort(self.transfers, "the next slot is planned")
         plan = computed.result
         if not isinstance(plan, StreamPlan):
             yield LogEntry(PLANNING_FAILED, {"slot": slot, "error": computed.error})
@@ -273,6 +280,11 @@ def _without_deadline(plan: Callable[[], StreamPlan], clock: Clock) -> StreamPla
     """Run a planner that needs no clock; unlike a closure, a pending job can be copied."""
     del clock
     return plan()
+
+
+def _aborted(transfer: CellTransfer) -> LogEntry:
+    data = {"roster": list(transfer.roster), "why": transfer.reason}
+    return LogEntry(TRANSFER_ABORTED, data)
 
 
 def _clusters(groups: Iterable[set[Name]]) -> list[set[Name]]:

@@ -33,9 +33,13 @@ from laneweave.coordinator.ballots.ballot_round import (
 from laneweave.coordinator.planning.conflict_kinds import Move
 from laneweave.coordinator.rolling.ownership import States, owned_cells
 from laneweave.protocol.lattice import Cell, PlannedMove, footprint
+from laneweave.protocol.names import first_names
 from laneweave.protocol.state_machine import RuleBook, Transition
 from laneweave.protocol.vehicle.plans import ownership_problems, plan_problems
 from laneweave.protocol.wire.messages import Ballot, Name, Plan, VehicleState
+
+MAX_NAMED = 3
+"""Maximum number of vehicles that a reason names."""
 
 
 @define(kw_only=True)
@@ -60,6 +64,13 @@ class CellTransfer(BallotRound):
         """Whether the ballot may still come into force."""
         return self.phase in UNFINISHED
 
+    @property
+    def unanswered(self) -> list[Name]:
+        """Members whose promise, or acceptance of the plan, is awaited."""
+        if self.phase is BallotPhase.ISSUING:
+            return [name for name in self.roster if name not in self.accepted]
+        return [name for name in self.roster if name not in self.promises]
+
     def on_state(self, state: VehicleState, states: States, now_s: float) -> None:
         """Handle a newer state of a member; `states` are the newest states of all vehicles."""
         self.take(STATE, now_s, state)
@@ -73,7 +84,8 @@ class CellTransfer(BallotRound):
 
     def abort(self, reason: str) -> None:
         """Abort because time has run out, unless the ballot is in force."""
-        self.rules.take(self, TOO_LATE, reason)
+        awaited = first_names(self.unanswered, MAX_NAMED)
+        self.rules.take(self, TOO_LATE, f"{reason}, and {awaited} did not answer")
 
     def _make_plan(self, states: States) -> Plan | str:
         """Return the plan from the promises, or the reason why there is none."""

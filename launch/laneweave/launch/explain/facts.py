@@ -124,6 +124,11 @@ class Facts:
     """Time of the last event of the run up to its departure."""
 
     @property
+    def aborted(self) -> bool:
+        """Whether the rolling operation has aborted a transfer of its cells."""
+        return any(event["kind"] == kinds.TRANSFER_ABORTED for event in self.events)
+
+    @property
     def absence(self) -> Absence | None:
         """Time without an agent in which the facts end, if any."""
         return (

@@ -136,7 +136,7 @@ class Bench:
     def order(self, t_s: float = LOOK_S, now_s: float | None = None) -> Compute | None:
         """Order at a road time; the node's clock is alike, unless it is given."""
         clock_s = t_s if now_s is None else now_s
-        orders = list(self.control.order(t_s, clock_s))
+        orders = [one for one in self.control.order(t_s, clock_s) if isinstance(one, Compute)]
         assert len(orders) <= 1
         return orders[0] if orders else None
 
@@ -633,6 +633,23 @@ def test_a_ballot_that_fails_is_noted() -> None:
     assert desk.hear(replace(shown(A), t_s=BEGUN_S + 1.0)) == []
 
 
+@pytest.mark.parametrize("answered", [(), (A,)])
+def test_a_ballot_without_answers_is_noted(answered: tuple[Name, ...]) -> None:
+    desk = bench(A, B, ways={A: ((0, 0), (0, 1))})
+    desk.think()
+    desk.hear(*(replace(shown(name, desk.transfer.ballot), t_s=BEGUN_S + 1.0) for name in answered))
+    awaited = ", ".join(name for name in (A, B) if name not in answered)
+    begins_s = (SLOT + 1) * SLOT_S
+    assert desk.transfer.unfinished
+    late = desk.control.order(begins_s + MAX_DELAY_S + 0.1, 50.0)
+    assert [one for one in late if isinstance(one, LogEntry)] == [
+        LogEntry(
+            "handover-given-up",
+            {"roster": [A, B], "why": f"its slot has begun, and {awaited} did not answer"},
+        )
+    ]
+
+
 # --- the census -------------------------------------------------------------------------------
 
 
@@ -640,7 +657,8 @@ def test_a_vehicle_that_leaves_is_forgotten_and_its_ballot_given_up() -> None:
     desk = bench(A, B, C, ways={A: ((0, 0), (0, 1)), C: ((-4, 0), (-5, 0))})
     desk.think()
     first, second = desk.control.transfers
-    desk.control.on_census(census(A, C))
+    (note,) = desk.control.on_census(census(A, C))
+    assert note.data == {"roster": [A, B], "why": "B has left"}
     assert set(desk.control.observed.states) == {A, C}
     assert (first.phase, first.reason) == (BallotPhase.ABORTED, "B has left")
     assert second.phase is BallotPhase.PREPARING
@@ -689,6 +707,7 @@ def test_the_real_planner_accepts_its_input() -> None:
     for name in (A, B):
         assert control.on_state(shown(name), 0.0) is None
     (compute,) = control.order(LOOK_S, 9.0)
+    assert isinstance(compute, Compute)
     plan = compute.work(time.monotonic)
     assert isinstance(plan, StreamPlan)
     assert set(plan.paths) == {A, B, C}

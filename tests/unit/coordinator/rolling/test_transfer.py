@@ -203,7 +203,10 @@ def test_what_is_in_force_or_given_up_stays_so() -> None:
     transfer = make_transfer()
     transfer.abort("no reason")
     hear(transfer, state(A, MID), state(B, MID))
-    assert (transfer.phase, transfer.reason) == (BallotPhase.ABORTED, "no reason")
+    assert (transfer.phase, transfer.reason) == (
+        BallotPhase.ABORTED,
+        "no reason, and A, B did not answer",
+    )
 
 
 # --- the table as a whole ---------------------------------------------------------------------

@@ -123,6 +123,24 @@ def test_a_later_plan_replaces_the_reason(tmp_path: Path) -> None:
     assert found.reason == Reason.NOT_COMPLETED
 
 
+def test_plans_of_the_rolling_operation(tmp_path: Path) -> None:
+    slots = [
+        at(t_s, "stream-planned", slot=slot, out_of_reach=out)
+        for slot, (t_s, out) in enumerate([(6.6, []), (12.6, []), (18.6, [V])])
+    ]
+    off = left(attended=True, reason="no-plan", unattended_since_s=None, leader_until_s=60.0)
+    start = [LEADER, ENTERED, *slots[:2]]
+    assert explained(tmp_path, [*start, slots[2], *off]).reason == Reason.NO_ROOM
+    lost = at(15.0, "caretaker-took-over", vehicle=W, reason="absent")
+    found = explained(tmp_path, [*start, lost, slots[2], *off])
+    assert found.reason == Reason.BLOCKED
+    assert "perhaps on its way: v0002 (no agent since 15.0 s)" in found.text
+    aborted = at(12.0, "handover-given-up", roster=[V, W], why="the next slot is planned")
+    found = explained(tmp_path, [*start, aborted, slots[2], *off])
+    assert found.reason == Reason.NO_ANSWER
+    assert "accepted none of the plans" in found.text
+
+
 @pytest.mark.parametrize("process", ["coordinator c1", "fleet east"])
 def test_a_process_with_other_settings(process: str, tmp_path: Path) -> None:
     different = {"road.lanes": [3, 4]}
