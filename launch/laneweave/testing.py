@@ -53,6 +53,7 @@ def laneweave_run(tmp_path: Path) -> LaneweaveRun:
     """Return a function that runs a scenario, with faults, in a folder of the test."""
     # Other tests in an environment with laneweave need not wait for this.
     from laneweave.launch.library.runs import RunFailedError, run
+    from laneweave.protocol.errors import BadInputError
 
     numbers = count(1)
 
@@ -77,6 +78,9 @@ def laneweave_run(tmp_path: Path) -> LaneweaveRun:
                 faults=faults,
                 **overrides,
             )
+        except BadInputError as error:
+            # The place in the test matters, not that in the library.
+            raise error.with_traceback(None) from None
         except RunFailedError as error:
             broken = "\n".join(error.problems)
         raise BrokenRunError(f"{broken}\nfiles of the run: {out}")

@@ -412,7 +412,7 @@ def _unknown_processes(
             if process in rule.names and not (
                 process in coordinators or vehicles is None or process in vehicles
             ):
-                allowed = f"{', '.join(kinds)}, or the name of a vehicle of the run"
+                allowed = _or_a_vehicle(kinds, vehicles)
                 yield unknown_name(f"messages[{index}].{name}", process, kinds, allowed)
 
 
@@ -424,8 +424,14 @@ def _unknown_targets(
     for name, fault in specification.role_faults():
         known = fault.target in kinds
         if not known and vehicles is not None and fault.target not in vehicles:
-            allowed = f"{', '.join(kinds)}, or the name of a vehicle of the run"
+            allowed = _or_a_vehicle(kinds, vehicles)
             yield unknown_name(f"{name}.target", fault.target, kinds, allowed)
+
+
+def _or_a_vehicle(kinds: Collection[str], vehicles: Collection[str] | None) -> str:
+    """Return the allowed targets as text."""
+    text = f"{', '.join(kinds)}, or the name of a vehicle of the run"
+    return f"{text}: {min(vehicles)} to {max(vehicles)}" if vehicles else text
 
 
 def _source(choice: Path | str, name: str) -> SourceFile:

@@ -74,15 +74,16 @@ class FaultSchedule:
         `applied` contains the names of the faults with at least one applied event.
         """
         lines = [
-            f"{fault.target} was not {fault.verb} at {fault.from_s:g} s: the road was at "
+            f"{name}: {fault.target} was not {fault.verb} at {fault.from_s:g} s: the road was at "
             f"{self._skipped[name]:.1f} s already"
             if name in self._skipped
-            else f"the run ended before {fault.target} was {fault.verb} at {fault.from_s:g} s"
+            else f"{name}: the run ended before {fault.target} was {fault.verb} "
+            f"at {fault.from_s:g} s"
             for name, fault in self._specification.role_faults()
             if name not in applied
         ]
         lines += [
-            f"the run ended before {name} came into force at {window.from_s:g} s"
+            f"{name}: the run ended before it came into force at {window.from_s:g} s"
             for name, window in self._specification.windows()
             if window.from_s > self._reached_s
         ]

@@ -101,7 +101,7 @@ def test_command_lines(laneweave: Here, arguments: list[str], named: str) -> Non
         (
             "run --faults FILE",
             "[[kill]]\ntarget = 'v9999'\nat_s = 1",
-            "name of a vehicle of the run",
+            "name of a vehicle of the run: v0001 to v0",
         ),
         ("run FILE", '"a\\nb" = 1', "a b: got an unknown key"),
         ("run FILE", '"" = 1', "'': got an unknown key"),

@@ -192,5 +192,5 @@ def test_what_was_due_before_the_command_began_is_left_out() -> None:
     faults.step(100.0, 0.0, view)
     assert [event.due_s for event in faults.waiting] == [100.0]
     late, unused = faults.unused_faults()
-    assert late == "c1 was not killed at 5 s: the road was at 100.0 s already"
-    assert unused.startswith("c1 was not killed at 90 s")
+    assert late == "kill[0]: c1 was not killed at 5 s: the road was at 100.0 s already"
+    assert unused.startswith("kill[1]: c1 was not killed at 90 s")

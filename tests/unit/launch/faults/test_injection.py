@@ -89,7 +89,7 @@ def test_a_fault_without_a_target_waits_for_one() -> None:
     faults = injection(roles, kill=(Kill(at_s=5.0),))
     faults.step(5.0, 0.0, view)
     assert roles.done == []
-    assert faults.unused_faults() == ["the run ended before leader was killed at 5 s"]
+    assert faults.unused_faults() == ["kill[0]: the run ended before leader was killed at 5 s"]
     leads(view, "c3")
     faults.step(5.5, 0.5, view)
     assert roles.done == [("kill", "c3")]

@@ -101,9 +101,9 @@ def test_faults_without_effect_are_reported() -> None:
     schedule = FaultSchedule(faults, 1)
     list(schedule.due(60.0))
     assert schedule.unused_faults({"kill[0]"}) == [
-        "the run ended before c1 was killed at 90 s",
-        "the run ended before agent was paused at 70 s",
-        "the run ended before partition[0] came into force at 65 s",
+        "kill[1]: the run ended before c1 was killed at 90 s",
+        "pause[0]: the run ended before agent was paused at 70 s",
+        "partition[0]: the run ended before it came into force at 65 s",
     ]
 
 
