@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from laneweave.coordinator.planning.request import PlanRequest
     from laneweave.coordinator.planning.response import PlanResponse
     from laneweave.coordinator.service.client import PlanClient, PlanError
+    from laneweave.launch.explain.explanation import Explanation
     from laneweave.launch.library.plans import plan
     from laneweave.launch.library.recorded_run import RecordedRun, load_run
     from laneweave.launch.library.runs import RunFailedError, load_scenario, run
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
 
 __all__ = (
     "BadInputError",
+    "Explanation",
     "PlanClient",
     "PlanError",
     "PlanRequest",
@@ -49,6 +51,7 @@ __all__ = (
 
 _MODULES = {
     "BadInputError": "laneweave.protocol.errors",
+    "Explanation": "laneweave.launch.explain.explanation",
     "PlanClient": "laneweave.coordinator.service.client",
     "PlanError": "laneweave.coordinator.service.client",
     "PlanRequest": "laneweave.coordinator.planning.request",

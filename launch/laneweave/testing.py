@@ -66,6 +66,9 @@ def laneweave_run(tmp_path: Path) -> LaneweaveRun:
         **overrides: Any,  # noqa: ANN401 (any field of a scenario)
     ) -> RunSummary:
         __tracebackhide__ = True
+        if "out" in overrides:
+            allowed = "nothing: each run has a folder of the test, `summary.folder`"
+            raise BadInputError("out", overrides["out"], allowed)
         out = tmp_path / f"run-{next(numbers)}"
         if transport is None and method == "formation":
             transport = "simulated"

@@ -129,16 +129,23 @@ def _origin(kind: Any) -> object:  # noqa: ANN401 (any annotation)
     return get_origin(kind)  # mypy rejects comparisons with its declared type
 
 
+_ITEMS: Mapping[Any, str] = {float: "numbers", int: "integers", str: "strings"}
+"""Names of the items of lists, for errors."""
+
+
 def _tuple_hook(kind: Any, converter: Converter) -> Hook:  # noqa: ANN401 (a generic alias)
     kinds = get_args(kind)
     hooks = [(converter.get_structure_hook(part), part) for part in kinds if part is not Ellipsis]
     endless = kinds[-1] is Ellipsis
+    names = {_ITEMS.get(part, "tables" if attrs.has(part) else "") for _, part in hooks}
+    described = ["" if endless else str(len(hooks)), min(names) if len(names) == 1 else ""]
+    allowed = " ".join(["a list of", *filter(None, described)]).removesuffix(" of")
 
     def hook_of_tuple(value: object, _: type) -> tuple[Any, ...]:
         if not isinstance(value, (list, tuple)):
-            raise BadInputError("", value, "a list")
+            raise BadInputError("", value, allowed)
         if not endless and len(value) != len(hooks):
-            raise BadInputError("", value, f"a list of {len(hooks)}")
+            raise BadInputError("", value, allowed)
         done: list[Any] = []
         problems: list[BadInputError] = []
         for number, (item, (hook, part)) in enumerate(zip(value, cycle(hooks))):

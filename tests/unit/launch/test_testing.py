@@ -16,6 +16,15 @@ def test_a_run_that_is_not_complete(laneweave_run):
 
 def test_an_unknown_fault(laneweave_run):
     laneweave_run(faults={"kill": [{"target": "leder", "at_s": 1.0}]})
+
+def test_several_wrong_values(laneweave_run):
+    laneweave_run(faults={"messages": [{"topics": ["sate"], "loss": 2.0, "between": "c1"}]})
+
+def test_arguments(laneweave_run):
+    laneweave_run(out="here")
+
+def test_faults_of_another_type(laneweave_run):
+    laneweave_run(faults=[1])
 """
 
 
@@ -43,4 +52,9 @@ def test_a_test_fails_with_the_reason(tmp_path: Path) -> None:
     assert "the run is not complete: limit" in ended.stdout
     assert "files of the run: " in ended.stdout
     assert "kill[0].target: got 'leder'" in ended.stdout
-    assert "Traceback" not in ended.stdout
+    assert "did you mean state?" in ended.stdout
+    assert "messages[0].loss: got 2.0; allowed: [0, 1]" in ended.stdout
+    assert "messages[0].between: got 'c1'; allowed: a list of 2 strings" in ended.stdout
+    assert "out: got 'here'; allowed: nothing" in ended.stdout
+    assert "faults: got [1]; allowed: tables of faults, a file, or the name" in ended.stdout
+    assert "launch/" not in ended.stdout, "frames of the library"

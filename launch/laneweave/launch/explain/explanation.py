@@ -49,7 +49,8 @@ class Explanation:
     text: str
     """One line: fate and reason."""
     story: tuple[StoryLine, ...]
-    """What happened to it and to those on which it depended, in the order of road time."""
+    """What happened to it and to those on which it depended, in the order of road time: lines with
+    `t_s`, `kind` and `text`."""
 
     def to_dict(self) -> dict[str, Any]:
         """Return the explanation as JSON values."""

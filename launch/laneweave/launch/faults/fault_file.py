@@ -326,7 +326,7 @@ class FaultSpec:
             allowed = (
                 f"nothing {where}, which has no packets; use [[messages]] to lose or delay messages"
             )
-            raise BadInputError("link", "a table", allowed)
+            raise BadInputError("link", Described("a table"), allowed)
 
     def check_outside(self) -> None:
         """Check that these faults can be applied to a deployment from outside its processes.
@@ -383,6 +383,8 @@ def load_faults(
         return FaultSpec()
     if isinstance(choice, Mapping):
         return _faults(dict(choice), coordinators, vehicles)
+    if not isinstance(choice, Path | str):
+        raise BadInputError(name, choice, "tables of faults, a file, or the name of a preset")
     source = _source(choice, name)
     with source.located():
         return _faults(source.tables, coordinators, vehicles)

@@ -14,8 +14,10 @@ from attrs import frozen
 from laneweave.launch.explain.explanation import Explanation, explain
 from laneweave.launch.recordings.runs import not_a_run, scenario_of, unreadable
 from laneweave.launch.recordings.trajectories import read_trajectories
+from laneweave.protocol.errors import unknown_name
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.summary import RunSummary, read_summary
+from laneweave.protocol.wire.events import FIELDS
 
 
 @frozen
@@ -67,19 +69,28 @@ class RecordedRun:
             kind: kind of the events, such as `plan-made`; None: all.
 
         Raises:
-            BadInputError: the file cannot be read.
+            BadInputError: there is no such kind, or the file cannot be read.
         """
         try:
             with (self.folder / "events.jsonl").open(encoding="utf-8") as lines:
                 events = [json.loads(line) for line in lines]
         except (OSError, ValueError) as error:
             raise not_a_run(self.folder, error) from error
-        return [event for event in events if kind is None or event["kind"] == kind]
+        if kind is None:
+            return events
+        found = [event for event in events if event["kind"] == kind]
+        # Plug-ins and other releases have kinds of their own.
+        if not found and kind not in FIELDS:
+            raise unknown_name("kind", kind, FIELDS)
+        return found
 
     def explain(self, vehicle: str) -> Explanation:
         """Return what happened to a vehicle, and why it missed its lane, if it did.
 
-            print(laneweave.load_run("runs/demo").explain("v0039").text)
+            found = laneweave.load_run("runs/demo").explain("v0039")
+            print(found.reason, found.text)
+            for line in found.story:
+                print(line.t_s, line.text)
 
         Raises:
             BadInputError: there is no such vehicle, or the events cannot be read.

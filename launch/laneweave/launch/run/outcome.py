@@ -148,7 +148,8 @@ def _violations(summary: RunSummary, *, interrupted: bool, of_sumo: bool) -> lis
         return found
     complete = summary.ending == Ending.COMPLETE.value
     if not complete:
-        found.append(f"the run is not complete: {summary.ending}")
+        limit = " (runtime.max_road_s)" if summary.ending == Ending.LIMIT.value else ""
+        found.append(f"the run is not complete: {summary.ending}{limit}")
     expected = vehicles.entered if complete and of_sumo else vehicles.demanded
     if vehicles.left < expected:
         missing = expected - vehicles.left

@@ -18,7 +18,7 @@ from typing import Any, Protocol
 import attrs
 from attrs import field, frozen
 
-from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.errors import BadInputError, unknown_name
 from laneweave.protocol.field_validators import within, within_or_none
 from laneweave.protocol.names import NAME_PATTERN
 from laneweave.protocol.runtime.metrics import MetricsSnapshot
@@ -51,7 +51,8 @@ MAX_HELD = 10_000
 def _message_topics(_: object, attribute: attrs.Attribute[Any], value: tuple[str, ...]) -> None:
     for name in value:
         if name not in MESSAGE_TOPICS:
-            raise BadInputError(attribute.name, name, "any of " + ", ".join(MESSAGE_TOPICS))
+            allowed = "any of " + ", ".join(MESSAGE_TOPICS)
+            raise unknown_name(attribute.name, name, MESSAGE_TOPICS, allowed)
 
 
 def _process(_: object, attribute: attrs.Attribute[Any], value: str) -> None:

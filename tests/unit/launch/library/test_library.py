@@ -105,7 +105,7 @@ def test_a_run_is_read(tmp_path: Path) -> None:
 def test_a_failed_run_is_an_exception(tmp_path: Path) -> None:
     with pytest.raises(laneweave.RunFailedError, match="did not leave the road") as error:
         laneweave.run(SHORT, out=tmp_path / "run", method="rule", runtime__max_road_s=20.0)
-    assert "the run is not complete: limit" in error.value.problems
+    assert "the run is not complete: limit (runtime.max_road_s)" in error.value.problems
     assert error.value.summary is not None
     assert laneweave.load_run(error.value.folder).summary.ending == "limit"
 

@@ -75,7 +75,7 @@ def test_a_run_without_problems(tmp_path: Path) -> None:
         (summary(overlaps=2), "2 pairs of vehicles overlapped"),
         (summary(left=3), "2 of 5 vehicles did not leave the road"),
         (summary(ending="interrupted"), "the run is not complete: interrupted"),
-        (summary(ending="limit"), "the run is not complete: limit"),
+        (summary(ending="limit"), "the run is not complete: limit (runtime.max_road_s)"),
     ],
 )
 def test_a_broken_promise_fails_a_run(tmp_path: Path, found: RunSummary, problem: str) -> None:
@@ -229,7 +229,7 @@ def test_all_reasons_are_printed(tmp_path: Path) -> None:
     assert [line for line in text.splitlines() if line.startswith("FAILED")] == [
         "FAILED: the router [9] ended",
         "FAILED: 1 pairs of vehicles overlapped",
-        "FAILED: the run is not complete: limit",
+        "FAILED: the run is not complete: limit (runtime.max_road_s)",
         "FAILED: 1 of 5 vehicles did not leave the road",
     ]
 
