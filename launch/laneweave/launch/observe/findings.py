@@ -14,10 +14,19 @@ from typing import ClassVar, Final
 
 from attrs import define, field, frozen
 
-from laneweave.launch.observe.observed import AGENT, BRIDGE, COORDINATOR, FLEET, Expected, Observed
+from laneweave.launch.observe.observed import (
+    AGENT,
+    BRIDGE,
+    COORDINATOR,
+    FLEET,
+    UNPLANNED_S,
+    Expected,
+    Observed,
+)
 from laneweave.launch.observe.process_view import label_of
 from laneweave.launch.observe.road_view import RoadView, claims_of
 from laneweave.protocol.names import first_names
+from laneweave.protocol.road_layout import ANY_LANE
 from laneweave.protocol.runtime.metrics import metric
 from laneweave.protocol.wire.codec import VERSION
 from laneweave.protocol.wire.common_settings import (
@@ -25,7 +34,7 @@ from laneweave.protocol.wire.common_settings import (
     different_groups,
     groups_of,
 )
-from laneweave.protocol.wire.messages import ClosedFormation
+from laneweave.protocol.wire.messages import ClosedFormation, Name
 from laneweave.protocol.wire.topics import Party
 
 ROUTER = str(Party.ROUTER)
@@ -35,8 +44,8 @@ STANDING_S = 2.0
 """Time for which the road may wait for agents."""
 UNATTENDED_S = 2.0
 """Time for which a vehicle may be without an agent."""
-UNPLANNED_S = 20.0
-"""Road time for which a closed formation may be without a plan."""
+MIN_UNPLANNED = 3
+"""Minimum number of vehicles of the rolling operation without a plan; a few may have no path."""
 CLOCK_OFF_S = 12 * 3600.0
 """Difference of clocks above which processes begin to refuse each other's messages (a day)."""
 MAX_NAMED = 3
@@ -189,14 +198,21 @@ def _coordinator_silent(observed: Observed) -> Found:
 
 
 def _nothing_planned(observed: Observed) -> Found:
-    """Formations have been closed for 20 s without a plan, and so have all behind them.
+    """For 20 s after a formation has closed, or vehicles could sort, nobody there has had a plan.
 
-    A single formation without a plan may have been closed too late to sort.
+    A single formation without a plan may have been closed too late to sort, and a few vehicles of
+    the rolling operation may have no path.
     """
-    view = observed.view
     claims = claims_of(observed.candidates)
-    if view.census is None or not claims:
-        return
+    what = _formations_without_plan(observed.view) or _vehicles_without_plan(observed)
+    if what and claims:
+        yield label_of(COORDINATOR, claims[0].coordinator), what
+
+
+def _formations_without_plan(view: RoadView) -> str:
+    """Return a text about the newest formations if they have no plan, or an empty one."""
+    if view.census is None:
+        return ""
     states = view.states.values()
     accepted = {state.block for state in states if state.accepted}
     unattended = {state.block for state in states if not state.attended}
@@ -208,11 +224,34 @@ def _nothing_planned(observed: Observed) -> Found:
             waiting = []
         elif view.t_s - one.closed_s >= UNPLANNED_S and unattended.isdisjoint(blocks):
             waiting += [one] if known.intersection(blocks) else []
-    if waiting:
-        longest_s = view.t_s - waiting[0].closed_s
-        have = "formation has" if len(waiting) == 1 else f"{len(waiting)} formations have"
-        what = f"the newest closed {have} no plan, for up to {longest_s:.0f} s"
-        yield label_of(COORDINATOR, claims[0].coordinator), what
+    if not waiting:
+        return ""
+    have = "formation has" if len(waiting) == 1 else f"{len(waiting)} formations have"
+    longest_s = view.t_s - waiting[0].closed_s
+    return f"the newest closed {have} no plan, for up to {longest_s:.0f} s"
+
+
+def _vehicles_without_plan(observed: Observed) -> str:
+    """Return a text about vehicles of the rolling operation without a plan, or an empty one.
+
+    Those count that entered after all that were in a ballot, and have had time to sort.
+    """
+    view, sorts_from_m = observed.view, observed.sorts_from_m
+    if view.census is None or sorts_from_m is None:
+        return ""
+    waiting: list[Name] = []
+    for entry in sorted(view.census.on_road, key=lambda entry: entry.entered_s):
+        state = view.states.get(entry.vehicle)
+        if state is None:
+            continue
+        if state.record.promised is not None:
+            waiting = []
+        elif state.attended and entry.preferred_lane not in (ANY_LANE, state.hold_cell[1]):
+            waiting += [entry.vehicle] if state.s_m >= sorts_from_m else []
+    if len(waiting) < MIN_UNPLANNED:
+        return ""
+    named = first_names(waiting, MAX_NAMED)
+    return f"{len(waiting)} vehicles off their lanes were in no plan for {UNPLANNED_S:g} s: {named}"
 
 
 def _fleet_missing(observed: Observed) -> Found:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 
 from attrs import field, frozen
@@ -17,6 +18,10 @@ from laneweave.protocol.wire.topics import ROLES, Party
 BRIDGE, COORDINATOR, FLEET, AGENT = (
     ROLES[party] for party in (Party.BRIDGE, Party.COORDINATOR, Party.FLEET, Party.VEHICLE)
 )
+
+
+UNPLANNED_S = 20.0
+"""Road time for which closed formations, or vehicles that could sort, may be without a plan."""
 
 
 @frozen
@@ -110,6 +115,25 @@ class Observed:
             for vehicle, state in view.states.items()
             if vehicle in listed and not state.attended
         }
+
+    @property
+    def sorts_from_m(self) -> float | None:
+        """Position at which a vehicle of the rolling operation has had time to sort [m].
+
+        From the settings of the bridge; None: unknown, or another operation.
+        """
+        of_bridge = (BRIDGE, BRIDGE, self.view.bridge)
+        settings = self.view.processes.settings.get(of_bridge)
+        try:
+            values = {} if settings is None else settings.values
+            if json.loads(values["formation.operation"]) != "rolling":
+                return None
+            begin_m = float(json.loads(values["road.s1_m"]))
+            if not json.loads(values["formation.sort_in_s2"]):
+                begin_m += float(json.loads(values["road.s2_m"]))
+            return begin_m + UNPLANNED_S * float(json.loads(values["formation.speed_mps"]))
+        except (KeyError, TypeError, ValueError):
+            return None  # of another release
 
     def unheard_s(self, bridge: int) -> float:
         """Return the time since a bridge was heard last, or since observation began."""

@@ -7,13 +7,14 @@ from typing import Any
 import pytest
 from attrs import evolve, frozen
 
-from laneweave.launch.observe.findings import RULES, UNPLANNED_S, Finding, Findings
-from laneweave.launch.observe.observed import Expected
+from laneweave.launch.observe.findings import RULES, Finding, Findings
+from laneweave.launch.observe.observed import UNPLANNED_S, Expected
 from laneweave.launch.observe.process_view import OtherVersion
 from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.runtime.transport import LinkDown
 from laneweave.protocol.scenario.common_settings import settings_of
 from laneweave.protocol.scenario.deployment_fields import Shard
+from laneweave.protocol.wire.common_settings import CommonSettings
 from laneweave.protocol.wire.identities import Identity
 from laneweave.protocol.wire.messages import Ballot, ClosedFormation, Name
 from laneweave.protocol.wire.topics import Party
@@ -223,6 +224,38 @@ def test_a_formation_that_came_too_late_is_no_finding_if_those_behind_it_are_pla
     (finding,) = found(listener)
     assert finding.rule == "nothing-planned"
     assert UNPLANNED_S < 30.0
+
+
+ROLLING = settings_of(parse_scenario({"formation": {"operation": "rolling"}}))
+SORTED_M = 400.0 + 15.0 * UNPLANNED_S
+"""Where vehicles of the paper's road have had time to sort."""
+
+
+@pytest.mark.parametrize(
+    ("settings", "changes", "planned"),
+    [
+        (ROLLING, {}, False),
+        (OWN, {}, True),  # formations, which have closed later
+        (ROLLING, {"v0003": {"promised": PROMISED}}, True),
+        (ROLLING, {"v0003": {"hold_cell": (-9, 0)}}, True),  # in its lane
+        (ROLLING, {"v0003": {"attended": False}}, True),
+        (ROLLING, {"v0003": {"s_m": SORTED_M - 1.0}}, True),
+        (ROLLING, {"v0001": {"promised": PROMISED}}, True),
+        (ROLLING, {"v0001": {"promised": PROMISED}, "v0004": {}}, False),
+    ],
+)
+def test_vehicles_of_the_rolling_operation_in_no_plan(
+    settings: CommonSettings, changes: dict[str, dict[str, Any]], *, planned: bool
+) -> None:
+    listener = healthy()
+    names = sorted({"v0001", "v0002", "v0003"} | changes.keys())
+    listener.census(1201, (), **{name: 70.0 + number for number, name in enumerate(names)})
+    for name in names:
+        values = {"hold_cell": (-9, 1), "s_m": SORTED_M + 1.0, "promised": None}
+        listener.states(name, [1201], **values | changes.get(name, {}))
+    listener.settings("bridge", "bridge", BRIDGE, settings)
+    nothing = [("nothing-planned", "coordinator c1")]
+    assert rules(found(listener)) == ([] if planned else nothing)
 
 
 def test_a_condition_must_last_unless_it_was_so_all_the_time() -> None:
