@@ -5,6 +5,7 @@ pytest loads it in every environment in which laneweave is installed.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -19,6 +20,12 @@ if TYPE_CHECKING:
 
 class BrokenRunError(AssertionError):
     """A run has failed or broken a promise; the message has all problems, and its folder."""
+
+    def __init__(self, problems: Sequence[str], folder: Path) -> None:
+        """Store the folder of the run and what is wrong with it."""
+        super().__init__("\n".join([*problems, f"files of the run: {folder}"]))
+        self.problems = tuple(problems)
+        self.folder = folder
 
 
 class LaneweaveRun(Protocol):
@@ -85,7 +92,7 @@ def laneweave_run(tmp_path: Path) -> LaneweaveRun:
             # The place in the test matters, not that in the library.
             raise error.with_traceback(None) from None
         except RunFailedError as error:
-            broken = "\n".join(error.problems)
-        raise BrokenRunError(f"{broken}\nfiles of the run: {out}")
+            problems = error.problems
+        raise BrokenRunError(problems, out)
 
     return run_scenario

@@ -257,7 +257,7 @@ class RunSummary:
     messages: Messages
     failover: LeaderChanges
     faults: dict[str, Any] | None = optional(
-        "injected faults, by kind; absent without a fault file"
+        "faults that were `injected`, and `partition_methods`; absent without a fault file"
     )
     plug_ins: list[str] | None = optional(
         "name and version of the distributions whose plug-ins made plans or drove vehicles"

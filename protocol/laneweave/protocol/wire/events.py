@@ -183,7 +183,7 @@ MEANINGS: Final[Mapping[str, str]] = {
     "fault": "table of the fault file, such as kill[0]",
     "action": "killed, restarted, paused or resumed; of rules, partitions, links: began or ended",
     "target": "process; senders and receivers of the rule (`c1 to v0002`, `v0001 and v0002`, "
-    "`all to all`); groups of the partition; group of the "
+    "`all to all`); groups of the partition (`bridge and others`); group of the "
     "link",
     "run_s": "time since the bridge was started, or since `faults apply` found the road [s, wall "
     "clock; simulated: virtual time]",
