@@ -27,6 +27,10 @@ class BrokenRunError(AssertionError):
         self.problems = tuple(problems)
         self.folder = folder
 
+    def __reduce__(self) -> tuple[type[BrokenRunError], tuple[tuple[str, ...], Path]]:
+        """Return how to copy the error to another process."""
+        return BrokenRunError, (self.problems, self.folder)
+
 
 class LaneweaveRun(Protocol):
     """Runs a scenario; the test fails if the run does, or breaks a promise."""
@@ -89,7 +93,9 @@ def laneweave_run(tmp_path: Path) -> LaneweaveRun:
                 **overrides,
             )
         except BadInputError as error:
-            # The place in the test matters, not that in the library.
+            # The place in the test matters, not that in the library, and all wrong values do.
+            for problem in error.problems[1:]:
+                error.add_note(str(problem))
             raise error.with_traceback(None) from None
         except RunFailedError as error:
             problems = error.problems

@@ -73,9 +73,9 @@ def drive(containers: Containers) -> None:
 
     leader = str(status(containers)["leader"])
     for service in (
-        "bridge",
         "agents-1",
         f"coordinator-{leader.removeprefix('c')}",
+        "bridge",  # in the middle: neither run ends meanwhile
         "router",
         "watch",
     ):

@@ -279,8 +279,8 @@ def test_a_fault_that_never_came_fails_the_run(lab: Lab, short: Path) -> None:
     )
 
     assert ended.status == 1
-    assert "FAILED: the run ended before leader was killed at 5000 s" in ended.out
-    assert "FAILED: the run ended before messages[0] came into force at 6000 s" in ended.out
+    assert "FAILED: kill[0]: the run ended before leader was killed at 5000 s" in ended.out
+    assert "FAILED: messages[0]: the run ended before it came into force at 6000 s" in ended.out
 
 
 @pytest.mark.more

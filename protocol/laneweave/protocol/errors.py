@@ -148,9 +148,6 @@ class SeveralBadInputsError(BadInputError):
             at_least=first.at_least,
         )
         self._problems = tuple(problems)
-        # Tracebacks, also those of pytest, show the notes below the message.
-        for problem in problems[1:]:
-            self.add_note(str(problem))
 
     @property
     def problems(self) -> tuple[BadInputError, ...]:

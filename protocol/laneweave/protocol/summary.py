@@ -257,7 +257,8 @@ class RunSummary:
     messages: Messages
     failover: LeaderChanges
     faults: dict[str, Any] | None = optional(
-        "faults that were `injected`, and `partition_methods`; absent without a fault file"
+        "faults that were `injected`, `partition_methods`, and perhaps `why_no_namespaces`; absent "
+        "without a fault file"
     )
     plug_ins: list[str] | None = optional(
         "name and version of the distributions whose plug-ins made plans or drove vehicles"

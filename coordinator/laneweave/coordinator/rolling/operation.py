@@ -283,7 +283,11 @@ def _without_deadline(plan: Callable[[], StreamPlan], clock: Clock) -> StreamPla
 
 
 def _aborted(transfer: CellTransfer) -> LogEntry:
-    data = {"roster": list(transfer.roster), "why": transfer.reason}
+    data = {
+        "roster": list(transfer.roster),
+        "why": transfer.reason,
+        "unanswered": list(transfer.unanswered),
+    }
     return LogEntry(TRANSFER_ABORTED, data)
 
 

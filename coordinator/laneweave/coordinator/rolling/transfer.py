@@ -8,7 +8,7 @@ vehicle restarts, or time runs out; its vehicles then hold, and the next slot is
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 from attrs import define, field
 from msgspec.structs import replace
@@ -58,6 +58,8 @@ class CellTransfer(BallotRound):
     """Departed vehicles that are in rosters of pending transfers."""
     reason: str = ""
     """Why the ballot was aborted."""
+    unanswered: tuple[Name, ...] = ()
+    """Members that had not answered when time had run out."""
 
     @property
     def unfinished(self) -> bool:
@@ -65,11 +67,9 @@ class CellTransfer(BallotRound):
         return self.phase in UNFINISHED
 
     @property
-    def unanswered(self) -> list[Name]:
-        """Members whose promise, or acceptance of the plan, is awaited."""
-        if self.phase is BallotPhase.ISSUING:
-            return [name for name in self.roster if name not in self.accepted]
-        return [name for name in self.roster if name not in self.promises]
+    def _answers(self) -> Collection[Name]:
+        """Members that have promised or, once there is a plan, accepted it."""
+        return self.accepted if self.phase is BallotPhase.ISSUING else self.promises
 
     def on_state(self, state: VehicleState, states: States, now_s: float) -> None:
         """Handle a newer state of a member; `states` are the newest states of all vehicles."""
@@ -84,8 +84,10 @@ class CellTransfer(BallotRound):
 
     def abort(self, reason: str) -> None:
         """Abort because time has run out, unless the ballot is in force."""
-        awaited = first_names(self.unanswered, MAX_NAMED)
-        self.rules.take(self, TOO_LATE, f"{reason}, and {awaited} did not answer")
+        if self.unfinished:
+            self.unanswered = tuple(name for name in self.roster if name not in self._answers)
+            awaited = first_names(self.unanswered, MAX_NAMED)
+            self.rules.take(self, TOO_LATE, f"{reason}, and {awaited} did not answer")
 
     def _make_plan(self, states: States) -> Plan | str:
         """Return the plan from the promises, or the reason why there is none."""

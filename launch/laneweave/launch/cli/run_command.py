@@ -194,24 +194,36 @@ def run(
     if shown and pace is None:
         pace = min(1.0, settings.runtime.max_pace)
     with _live_page(watch_listen, shown=shown) as page:
-        outcome = perform_run(
-            settings,
-            out=out,
-            method=method,
-            transport=None if transport is None else transport.value,
-            faults=faults,
-            pace=pace,
-            show_progress=show,
-            announce=announce,
-            warn=warn,
-            start_page=None if page is None else page.start,
-        )
+        with _faults_as_option():
+            outcome = perform_run(
+                settings,
+                out=out,
+                method=method,
+                transport=None if transport is None else transport.value,
+                faults=faults,
+                pace=pace,
+                show_progress=show,
+                announce=announce,
+                warn=warn,
+                start_page=None if page is None else page.start,
+            )
         drawn = _finish(outcome, report=report)
         if page is not None:
             page.end(f"{outcome.ending}, report at {drawn}" if drawn else outcome.ending)
     if compare and outcome.summary is not None and outcome.summary.ending == "complete":
         _compare(settings, outcome.folder, show=show)
     raise typer.Exit(outcome.exit_status)
+
+
+@contextmanager
+def _faults_as_option() -> Iterator[None]:
+    """Name the option in errors about the argument `faults` of the library."""
+    try:
+        yield
+    except BadInputError as error:
+        if error.field != "faults":
+            raise
+        raise error.of("--faults") from error
 
 
 def _check_sumo_options(settings: Scenario, volume: float | None, *, compare: bool) -> None:

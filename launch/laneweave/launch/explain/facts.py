@@ -100,6 +100,12 @@ class Facts:
     """Newest `vehicles-awaited` since the last plan in force."""
     rolling: bool = False
     """Whether the run plans in slots."""
+    unanswered: bool = False
+    """Whether it had not answered its last ballot when a plan did not lead it to its lane."""
+    silent_until_s: float = -math.inf
+    """When a ballot was given up last because it had not answered."""
+    slot_planned_s: float = -math.inf
+    """Time of the newest plan of a slot."""
     late_slots: int = 0
     """Number of plans of slots that failed or were late while it was on the road."""
     lane_end: Event | None = None
@@ -122,11 +128,6 @@ class Facts:
     """The newest event `leader`."""
     end_s: float = 0.0
     """Time of the last event of the run up to its departure."""
-
-    @property
-    def aborted(self) -> bool:
-        """Whether the rolling operation has aborted a transfer of its cells."""
-        return any(event["kind"] == kinds.TRANSFER_ABORTED for event in self.events)
 
     @property
     def absence(self) -> Absence | None:
@@ -202,7 +203,13 @@ def _add(facts: Facts, event: Event) -> None:
     elif kind in (kinds.STREAM_PLANNED, kinds.PLANNING_FAILED, kinds.PLANNING_LATE):
         _add_slot(facts, event)
     elif _is_around(facts.vehicle, event):
-        facts.events.append(event)
+        _add_around(facts, event)
+
+
+def _add_around(facts: Facts, event: Event) -> None:
+    facts.events.append(event)
+    if facts.vehicle in event.get("unanswered", ()):
+        facts.silent_until_s = float(event["t_s"])
 
 
 def _is_around(vehicle: str, event: Event) -> bool:
@@ -306,9 +313,12 @@ def _add_slot(facts: Facts, event: Event) -> None:
         return
     if event["kind"] != kinds.STREAM_PLANNED:
         facts.late_slots += 1
-    elif facts.vehicle in event.get("out_of_reach", ()):
-        facts.out_of_reach = event
-        facts.events.append(event)
+    else:
+        if facts.vehicle in event.get("out_of_reach", ()):
+            facts.out_of_reach = event
+            facts.unanswered = facts.silent_until_s >= facts.slot_planned_s
+            facts.events.append(event)
+        facts.slot_planned_s = float(event["t_s"])
 
 
 def _add_leader(facts: Facts, event: Event) -> None:

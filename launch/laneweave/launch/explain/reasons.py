@@ -155,7 +155,7 @@ def _unreached(facts: Facts) -> Finding | None:
         return _absence(facts.absence)
     if facts.rolling and facts.leaderless_since_s is not None:
         return _no_leader(facts.leaderless_since_s)
-    if facts.aborted and (facts.off_lane or {}).get("reason") == reasons.NO_PLAN:
+    if facts.unanswered and (facts.off_lane or {}).get("reason") == reasons.NO_PLAN:
         return Finding(Reason.NO_ANSWER, "it has accepted none of the plans of the leader")
     if facts.without_agent:
         by = _with_absences(facts, facts.without_agent)

@@ -433,7 +433,10 @@ def _unknown_targets(
 def _or_a_vehicle(kinds: Collection[str], vehicles: Collection[str] | None) -> str:
     """Return the allowed targets as text."""
     text = f"{', '.join(kinds)}, or the name of a vehicle of the run"
-    return f"{text}: {min(vehicles)} to {max(vehicles)}" if vehicles else text
+    if not vehicles:
+        return text
+    in_order = sorted(vehicles, key=lambda name: (len(name), name))
+    return f"{text}: {in_order[0]} to {in_order[-1]}"
 
 
 def _source(choice: Path | str, name: str) -> SourceFile:

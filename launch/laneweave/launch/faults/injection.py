@@ -200,7 +200,7 @@ class FaultInjection:
     def unused_faults(self) -> list[str]:
         """Return a line for each fault that had no effect."""
         return self.schedule.unused_faults(set(self._targets)) + [
-            f"{' and '.join(rule.names)} did not run while {name} was in force"
+            f"{name}: {' and '.join(rule.names)} did not run while it was in force"
             for name, rule in self._unmet.items()
             if name in self._began
         ]

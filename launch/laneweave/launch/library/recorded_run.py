@@ -69,7 +69,8 @@ class RecordedRun:
             kind: kind of the events, such as `plan-made`; None: all.
 
         Raises:
-            BadInputError: there is no such kind, or the file cannot be read.
+            BadInputError: the file cannot be read, or the run has no such event and this release no
+                such kind.
         """
         try:
             with (self.folder / "events.jsonl").open(encoding="utf-8") as lines:

@@ -199,7 +199,8 @@ def _run_formations(
 ) -> Outcome:
     check_moves(scenario)
     demand = demand_of(scenario)
-    specification = load_faults(faults, coordinator_names(scenario), {*demand.vehicles})
+    vehicles = {*demand.vehicles}
+    specification = load_faults(faults, coordinator_names(scenario), vehicles, name="faults")
     # Coordinators in other processes load the solver there; errors are reported here.
     prepare(scenario.formation.solver, "formation.solver", keep=transport == SIMULATED)
     if transport != SIMULATED:

@@ -198,7 +198,7 @@ def _coordinator_silent(observed: Observed) -> Found:
 
 
 def _nothing_planned(observed: Observed) -> Found:
-    """For 20 s after a formation has closed, or vehicles could sort, nobody there has had a plan.
+    """The newest formations have been closed, or vehicles able to move, for 20 s without a plan.
 
     A single formation without a plan may have been closed too late to sort, and a few vehicles of
     the rolling operation may have no path.
@@ -234,20 +234,25 @@ def _formations_without_plan(view: RoadView) -> str:
 def _vehicles_without_plan(observed: Observed) -> str:
     """Return a text about vehicles of the rolling operation without a plan, or an empty one.
 
-    Those count that entered after all that were in a ballot, and have had time to sort.
+    Those count that entered after all that were in a ballot, and have been able to move for 20 s.
     """
-    view, sorts_from_m = observed.view, observed.sorts_from_m
-    if view.census is None or sorts_from_m is None:
+    view, planned_from_m = observed.view, observed.planned_from_m
+    if view.census is None or planned_from_m is None:
         return ""
     waiting: list[Name] = []
-    for entry in sorted(view.census.on_road, key=lambda entry: entry.entered_s):
+    for entry in sorted(view.census.on_lattice, key=lambda entry: entry.entered_s):
         state = view.states.get(entry.vehicle)
         if state is None:
             continue
         if state.record.promised is not None:
             waiting = []
-        elif state.attended and entry.preferred_lane not in (ANY_LANE, state.hold_cell[1]):
-            waiting += [entry.vehicle] if state.s_m >= sorts_from_m else []
+        elif (
+            state.attended
+            and entry.preferred_lane not in (ANY_LANE, state.hold_cell[1])
+            and state.s_m >= planned_from_m
+            and view.t_s >= max(entry.entered_s, entry.ready_s) + UNPLANNED_S
+        ):
+            waiting.append(entry.vehicle)
     if len(waiting) < MIN_UNPLANNED:
         return ""
     named = first_names(waiting, MAX_NAMED)
@@ -404,7 +409,9 @@ RULES: Final = (
     Rule("agent-missing", _agent_missing, "start it", lasts_s=0.5),
     Rule("road-stands", _road_stands, "start or restart the process of the agents"),
     Rule("unattended", _unattended, "start or restart the process of the agents"),
-    Rule("nothing-planned", _nothing_planned, "read its log, or restart it", lasts_s=0.5),
+    Rule(
+        "nothing-planned", _nothing_planned, "read its log; if this lasts, restart it", lasts_s=0.5
+    ),
     Rule(
         "not-recorded",
         _not_recorded,

@@ -12,6 +12,7 @@ from laneweave.launch.observe.road_view import Coordinator, RoadView
 from laneweave.protocol.config.participants import coordinator_names
 from laneweave.protocol.scenario.deployment_fields import Shard, parse_shard
 from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.road_geometry import first_moves_m
 from laneweave.protocol.wire.process_messages import RoadStatus
 from laneweave.protocol.wire.topics import ROLES, Party
 
@@ -20,8 +21,9 @@ BRIDGE, COORDINATOR, FLEET, AGENT = (
 )
 
 
+ROLLING = "rolling"
 UNPLANNED_S = 20.0
-"""Road time for which closed formations, or vehicles that could sort, may be without a plan."""
+"""Road time for which a closed formation, or a vehicle that may move, may be without a plan."""
 
 
 @frozen
@@ -117,23 +119,30 @@ class Observed:
         }
 
     @property
-    def sorts_from_m(self) -> float | None:
-        """Position at which a vehicle of the rolling operation has had time to sort [m].
+    def planned_from_m(self) -> float | None:
+        """Position at which a vehicle of the rolling operation has been able to move for 20 s [m].
 
-        From the settings of the bridge; None: unknown, or another operation.
+        From the settings of the bridge. None: they are unknown, formations are planned, or the road
+        has exits: whoever prefers an exit's lane waits until it opens.
         """
-        of_bridge = (BRIDGE, BRIDGE, self.view.bridge)
-        settings = self.view.processes.settings.get(of_bridge)
+        settings = self.view.processes.settings.get((BRIDGE, BRIDGE, self.view.bridge))
+        if settings is None:
+            return None
         try:
-            values = {} if settings is None else settings.values
-            if json.loads(values["formation.operation"]) != "rolling":
+            values = {name: json.loads(text) for name, text in settings.values.items()}
+            if values["formation.operation"] != ROLLING or values["exit"]:
                 return None
-            begin_m = float(json.loads(values["road.s1_m"]))
-            if not json.loads(values["formation.sort_in_s2"]):
-                begin_m += float(json.loads(values["road.s2_m"]))
-            return begin_m + UNPLANNED_S * float(json.loads(values["formation.speed_mps"]))
-        except (KeyError, TypeError, ValueError):
+            speed_mps = float(values["formation.speed_mps"])
+            begin_m = first_moves_m(
+                float(values["road.s1_m"]),
+                float(values["road.s2_m"]),
+                speed_mps,
+                float(values["formation.settle_s"]),
+                in_s2=bool(values["formation.sort_in_s2"]),
+            )
+        except (KeyError, OverflowError, TypeError, ValueError):
             return None  # of another release
+        return begin_m + UNPLANNED_S * speed_mps
 
     def unheard_s(self, bridge: int) -> float:
         """Return the time since a bridge was heard last, or since observation began."""

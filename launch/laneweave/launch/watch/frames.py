@@ -71,6 +71,7 @@ from laneweave.protocol.wire.events import (
     LEFT,
     PLAN_EVENTS,
     PLAN_IN_FORCE,
+    TRANSFER_ABORTED,
 )
 from laneweave.protocol.wire.messages import CAR
 
@@ -88,7 +89,7 @@ MAX_EVENTS: Final = 8
 MAX_EVENT_CHARACTERS: Final = 90
 MAX_NUMBER: Final = 1e12
 FREQUENT_EVENTS: Final = (
-    *PLAN_EVENTS, PLAN_IN_FORCE, FORMATION_CLOSED, ENTERED, LEFT,
+    *PLAN_EVENTS, PLAN_IN_FORCE, TRANSFER_ABORTED, FORMATION_CLOSED, ENTERED, LEFT,
 )  # fmt: skip
 """Events not shown, because they would displace all others."""
 

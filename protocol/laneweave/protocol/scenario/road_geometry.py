@@ -17,6 +17,17 @@ from laneweave.protocol.scenario.formation_table import FormationSettings
 from laneweave.protocol.scenario.road_tables import Closure, Entrance, EntryPoint, Exit, Road
 
 
+def first_moves_m(
+    s1_m: float, s2_m: float, speed_mps: float, settle_s: float, *, in_s2: bool
+) -> float:
+    """Return the position [m] from which vehicles may move between cells.
+
+    The start of S3; with `in_s2` the place in S2 that they reach 4 s after they have settled.
+    """
+    start_m = s1_m + s2_m
+    return min(start_m, max(s1_m, speed_mps * (settle_s + 4.0))) if in_s2 else start_m
+
+
 @frozen
 class RoadGeometry:
     """Sections of lanes, entrances, exits, and times at v_F between them."""
@@ -146,7 +157,11 @@ class RoadGeometry:
     @property
     def moves_from_m(self) -> float:
         """Position [m] from which vehicles may move between cells: in S2, or the start of S3."""
-        start_m, formation = self._road.sorting_start_m, self._formation
-        if not formation.moves_in_s2:
-            return start_m
-        return min(start_m, max(self._road.s1_m, formation.speed_mps * (formation.settle_s + 4.0)))
+        road, formation = self._road, self._formation
+        return first_moves_m(
+            road.s1_m,
+            road.s2_m,
+            formation.speed_mps,
+            formation.settle_s,
+            in_s2=formation.moves_in_s2,
+        )

@@ -77,6 +77,7 @@ def test_planner_agrees_with_the_oracle_on_long_instances(oracle: Oracle) -> Non
 
 
 @pytest.mark.full
+@pytest.mark.timeout(3600)
 @chunks(MORE_INSTANCES, first=INSTANCES)
 def test_planner_agrees_with_the_oracle_on_many_more(seeds: range) -> None:
     oracle = partial(milp_oracle.optimal_cost, limit_s=MORE_LIMIT_S)

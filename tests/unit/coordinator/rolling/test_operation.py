@@ -629,7 +629,8 @@ def test_a_ballot_that_fails_is_noted() -> None:
     desk = bench(A, B, ways={A: ((0, 0), (0, 1))})
     desk.think()
     (note,) = desk.hear(replace(shown(B, Ballot(9, Name("c2"), 1, 1)), t_s=BEGUN_S + 1.0))
-    assert (note.kind, note.data) == ("handover-given-up", {"roster": [A, B], "why": "outbid"})
+    assert note.kind == "handover-given-up"
+    assert note.data == {"roster": [A, B], "why": "outbid", "unanswered": []}
     assert desk.hear(replace(shown(A), t_s=BEGUN_S + 1.0)) == []
 
 
@@ -645,9 +646,27 @@ def test_a_ballot_without_answers_is_noted(answered: tuple[Name, ...]) -> None:
     assert [one for one in late if isinstance(one, LogEntry)] == [
         LogEntry(
             "handover-given-up",
-            {"roster": [A, B], "why": f"its slot has begun, and {awaited} did not answer"},
+            {
+                "roster": [A, B],
+                "why": f"its slot has begun, and {awaited} did not answer",
+                "unanswered": awaited.split(", "),
+            },
         )
     ]
+    again = desk.control.order(begins_s + MAX_DELAY_S + 0.2, 50.0)
+    assert [one for one in again if isinstance(one, LogEntry)] == []
+
+
+def test_a_ballot_that_the_next_plan_ends_is_noted() -> None:
+    desk = bench(A, B, ways={A: ((0, 0), (0, 1))})
+    desk.think()
+    desk.hear(*(replace(shown(name, desk.transfer.ballot), t_s=BEGUN_S + 1.0) for name in (A, B)))
+    assert desk.transfer.plan is not None
+    accepted = changed(shown(A, desk.transfer.ballot, accepted=True), t_s=BEGUN_S + 1.1)
+    desk.hear(accepted)
+    notes = desk.think(LOOK_S + SLOT_S)
+    assert [note.kind for note in notes] == ["handover-given-up", "stream-planned"]
+    assert notes[0].data["unanswered"] == [B]
 
 
 # --- the census -------------------------------------------------------------------------------
@@ -658,7 +677,7 @@ def test_a_vehicle_that_leaves_is_forgotten_and_its_ballot_given_up() -> None:
     desk.think()
     first, second = desk.control.transfers
     (note,) = desk.control.on_census(census(A, C))
-    assert note.data == {"roster": [A, B], "why": "B has left"}
+    assert note.data == {"roster": [A, B], "why": "B has left", "unanswered": []}
     assert set(desk.control.observed.states) == {A, C}
     assert (first.phase, first.reason) == (BallotPhase.ABORTED, "B has left")
     assert second.phase is BallotPhase.PREPARING

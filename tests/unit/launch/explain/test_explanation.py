@@ -135,10 +135,18 @@ def test_plans_of_the_rolling_operation(tmp_path: Path) -> None:
     found = explained(tmp_path, [*start, lost, slots[2], *off])
     assert found.reason == Reason.BLOCKED
     assert "perhaps on its way: v0002 (no agent since 15.0 s)" in found.text
-    aborted = at(12.0, "handover-given-up", roster=[V, W], why="the next slot is planned")
-    found = explained(tmp_path, [*start, aborted, slots[2], *off])
+
+    def given_up(t_s: float, unanswered: list[str]) -> Event:
+        why = "its slot has begun"
+        return at(t_s, "handover-given-up", roster=[V, W], why=why, unanswered=unanswered)
+
+    found = explained(tmp_path, [*start, given_up(13.0, [V]), slots[2], *off])
     assert found.reason == Reason.NO_ANSWER
     assert "accepted none of the plans" in found.text
+    # Others did not answer, or an earlier ballot was given up.
+    for event in (given_up(13.0, [W]), given_up(12.0, [V])):
+        found = explained(tmp_path, [*start, event, slots[2], *off])
+        assert found.reason == Reason.NO_ROOM
 
 
 @pytest.mark.parametrize("process", ["coordinator c1", "fleet east"])

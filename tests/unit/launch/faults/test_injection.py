@@ -240,8 +240,8 @@ def test_the_killed_bridge_ends_the_run() -> None:
     ("names", "agents", "unused"),
     [
         (("c1", "v1"), ("v1",), []),
-        (("c1", "v1"), (), ["c1 and v1 did not run while messages[0] was in force"]),
-        (("c9", "vehicle"), ("v1",), ["c9 did not run while messages[0] was in force"]),
+        (("c1", "v1"), (), ["messages[0]: c1 and v1 did not run while it was in force"]),
+        (("c9", "vehicle"), ("v1",), ["messages[0]: c9 did not run while it was in force"]),
     ],
 )
 def test_a_rule_for_a_process_that_never_runs_is_unused(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -10,7 +11,7 @@ from attrs import evolve, frozen
 from laneweave.launch.observe.findings import RULES, Finding, Findings
 from laneweave.launch.observe.observed import UNPLANNED_S, Expected
 from laneweave.launch.observe.process_view import OtherVersion
-from laneweave.protocol.config.scenario_files import parse_scenario
+from laneweave.protocol.config.scenario_files import load_scenario, parse_scenario
 from laneweave.protocol.runtime.transport import LinkDown
 from laneweave.protocol.scenario.common_settings import settings_of
 from laneweave.protocol.scenario.deployment_fields import Shard
@@ -227,6 +228,8 @@ def test_a_formation_that_came_too_late_is_no_finding_if_those_behind_it_are_pla
 
 
 ROLLING = settings_of(parse_scenario({"formation": {"operation": "rolling"}}))
+IN_S2 = settings_of(parse_scenario({"formation": {"operation": "rolling", "sort_in_s2": True}}))
+EXIT = settings_of(load_scenario(Path("scenarios/off-ramp.toml")))
 SORTED_M = 400.0 + 15.0 * UNPLANNED_S
 """Where vehicles of the paper's road have had time to sort."""
 
@@ -241,6 +244,10 @@ SORTED_M = 400.0 + 15.0 * UNPLANNED_S
         (ROLLING, {"v0003": {"attended": False}}, True),
         (ROLLING, {"v0003": {"s_m": SORTED_M - 1.0}}, True),
         (ROLLING, {"v0001": {"promised": PROMISED}}, True),
+        (IN_S2, {}, False),
+        (IN_S2, {"v0003": {"s_m": 15.0 * (10.0 + 4.0 + UNPLANNED_S) + 1.0}}, False),
+        (IN_S2, {"v0003": {"s_m": 15.0 * (10.0 + 4.0 + UNPLANNED_S) - 1.0}}, True),
+        (EXIT, {}, True),
         (ROLLING, {"v0001": {"promised": PROMISED}, "v0004": {}}, False),
     ],
 )
@@ -249,13 +256,17 @@ def test_vehicles_of_the_rolling_operation_in_no_plan(
 ) -> None:
     listener = healthy()
     names = sorted({"v0001", "v0002", "v0003"} | changes.keys())
-    listener.census(1201, (), **{name: 70.0 + number for number, name in enumerate(names)})
+    entered_s = {name: 70.0 + number for number, name in enumerate(names)}
+    listener.census(1201, (), **entered_s)
     for name in names:
         values = {"hold_cell": (-9, 1), "s_m": SORTED_M + 1.0, "promised": None}
         listener.states(name, [1201], **values | changes.get(name, {}))
     listener.settings("bridge", "bridge", BRIDGE, settings)
     nothing = [("nothing-planned", "coordinator c1")]
     assert rules(found(listener)) == ([] if planned else nothing)
+    # From a ramp: they have entered just now.
+    listener.census(1202, (), **dict.fromkeys(names, 110.0))
+    assert rules(found(listener)) == []
 
 
 def test_a_condition_must_last_unless_it_was_so_all_the_time() -> None:
