@@ -93,7 +93,7 @@ def laneweave_run(tmp_path: Path) -> LaneweaveRun:
                 **overrides,
             )
         except BadInputError as error:
-            # The place in the test matters, not that in the library, and all wrong values do.
+            # pytest shows the line of the test instead of frames of the library, and all errors.
             for problem in error.problems[1:]:
                 error.add_note(str(problem))
             raise error.with_traceback(None) from None

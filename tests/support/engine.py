@@ -161,11 +161,11 @@ class Containers:
     def wait_healthy(self, *services: str) -> None:
         """Wait until services are healthy."""
         for service in services:
-            wait_until(partial(self.healthy, service), READY_S, lambda name=service: name)  # type: ignore[misc]
+            wait_until(partial(self.healthy, service), READY_S, partial(str, service))
 
     @contextmanager
     def frozen(self, service: str) -> Iterator[None]:
-        """Stop the process of a service, which keeps its connections, and let it go on."""
+        """Stop the processes of a service with SIGSTOP, and resume them at the end."""
         self.execute(service, "sh", "-c", "kill -STOP -1")
         try:
             yield

@@ -23,7 +23,7 @@ from support.waiting import wait_until
 RUN_S = 600.0
 """Three times the duration of the run."""
 SICK_S = 20.0
-"""Longest time until the health check of a process that hangs fails."""
+"""Maximum time until a health check fails because its process hangs."""
 MB = 1_000_000
 SIZES_MB = {"base": 200, "agent": 330, "coordinator": 530, "sim": 900}
 """Largest size of each image, without the base image."""
@@ -61,7 +61,7 @@ def test_the_deployment_runs_in_containers(capsys: pytest.CaptureFixture[str]) -
 def drive(containers: Containers) -> None:
     """Start the deployment, stop and kill a process of each role, and check the run's end."""
     roles = [name for name, service in containers.services.items() if lasts(service)]
-    # As `depends_on` says, which not every engine follows: these are healthy before the bridge.
+    # Not every engine obeys `depends_on`: start first what the bridge depends on.
     before = list(containers.services["bridge"]["depends_on"])
     containers.up(*before)
     assert containers.wait_ended("certs", 60.0) == 0
@@ -90,7 +90,7 @@ def drive(containers: Containers) -> None:
 
 
 def check_health(containers: Containers, service: str, others: set[str]) -> None:
-    """Check that the health check of a service that hangs says so, and that of no other one."""
+    """Check that only the health check of a service fails while its process hangs."""
     with containers.frozen(service):
         wait_until(lambda: not containers.healthy(service), SICK_S)
         # Without the router nothing is known of any process.

@@ -133,13 +133,19 @@ _ITEMS: Mapping[Any, str] = {float: "numbers", int: "integers", str: "strings"}
 """Names of the items of lists, for errors."""
 
 
+def _list_of(kinds: list[Any], *, endless: bool) -> str:
+    """Return the words for a list of these kinds of items, such as `a list of 2 numbers`."""
+    item = kinds[0] if len({*kinds}) == 1 else None
+    items = _ITEMS.get(item, "tables" if item is not None and attrs.has(item) else "")
+    words = f"{'' if endless else len(kinds)} {items}".strip()
+    return f"a list of {words}" if words else "a list"
+
+
 def _tuple_hook(kind: Any, converter: Converter) -> Hook:  # noqa: ANN401 (a generic alias)
     kinds = get_args(kind)
     hooks = [(converter.get_structure_hook(part), part) for part in kinds if part is not Ellipsis]
     endless = kinds[-1] is Ellipsis
-    names = {_ITEMS.get(part, "tables" if attrs.has(part) else "") for _, part in hooks}
-    described = ["" if endless else str(len(hooks)), min(names) if len(names) == 1 else ""]
-    allowed = " ".join(["a list of", *filter(None, described)]).removesuffix(" of")
+    allowed = _list_of([part for _, part in hooks], endless=endless)
 
     def hook_of_tuple(value: object, _: type) -> tuple[Any, ...]:
         if not isinstance(value, (list, tuple)):

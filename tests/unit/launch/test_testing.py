@@ -57,4 +57,5 @@ def test_a_test_fails_with_the_reason(tmp_path: Path) -> None:
     assert "messages[0].between: got 'c1'; allowed: a list of 2 strings" in ended.stdout
     assert "out: got 'here'; allowed: nothing" in ended.stdout
     assert " faults: got [1]; allowed: tables of faults, a file, or the name" in ended.stdout
+    assert "Traceback" not in ended.stdout
     assert "launch/" not in ended.stdout, "frames of the library"

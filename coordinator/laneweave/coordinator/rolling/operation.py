@@ -140,16 +140,14 @@ class RollingOperation:
         aborted = []
         for name in self.observed.on_census(census):
             transfer = self._transfer_of.pop(name, None)
-            if transfer is not None and transfer.unfinished:
-                transfer.on_left(name)
+            if transfer is not None and transfer.on_left(name):
                 aborted.append(_aborted(transfer))
         return aborted
 
     def _abort(self, transfers: Iterable[CellTransfer], reason: str) -> Iterator[LogEntry]:
-        """Abort those of the ballots that are unfinished."""
+        """Abort those of the ballots that are not decided."""
         for transfer in transfers:
-            if transfer.unfinished:
-                transfer.abort(reason)
+            if transfer.abort(reason):
                 yield _aborted(transfer)
 
     def outgoing(self, now_s: float) -> Iterator[tuple[Name, Prepare | Plan]]:

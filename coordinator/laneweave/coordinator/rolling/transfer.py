@@ -8,7 +8,7 @@ vehicle restarts, or time runs out; its vehicles then hold, and the next slot is
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 
 from attrs import define, field
 from msgspec.structs import replace
@@ -66,11 +66,6 @@ class CellTransfer(BallotRound):
         """Whether the ballot may still come into force."""
         return self.phase in UNFINISHED
 
-    @property
-    def _answers(self) -> Collection[Name]:
-        """Members that have promised or, once there is a plan, accepted it."""
-        return self.accepted if self.phase is BallotPhase.ISSUING else self.promises
-
     def on_state(self, state: VehicleState, states: States, now_s: float) -> None:
         """Handle a newer state of a member; `states` are the newest states of all vehicles."""
         self.take(STATE, now_s, state)
@@ -78,16 +73,13 @@ class CellTransfer(BallotRound):
             plan = self._make_plan(states)
             self.take(PLANNED if isinstance(plan, Plan) else FAILED, now_s, plan)
 
-    def on_left(self, vehicle: Name) -> None:
-        """Abort because a member has left the road."""
-        self.rules.take(self, MEMBERS, f"{vehicle} has left")
+    def on_left(self, vehicle: Name) -> bool:
+        """Abort because a member has left the road; return whether this ends the ballot."""
+        return self.rules.take(self, MEMBERS, f"{vehicle} has left") is not None
 
-    def abort(self, reason: str) -> None:
-        """Abort because time has run out, unless the ballot is in force."""
-        if self.unfinished:
-            self.unanswered = tuple(name for name in self.roster if name not in self._answers)
-            awaited = first_names(self.unanswered, MAX_NAMED)
-            self.rules.take(self, TOO_LATE, f"{reason}, and {awaited} did not answer")
+    def abort(self, reason: str) -> bool:
+        """Abort because time has run out; return whether this ends the ballot."""
+        return self.rules.take(self, TOO_LATE, reason) is not None
 
     def _make_plan(self, states: States) -> Plan | str:
         """Return the plan from the promises, or the reason why there is none."""
@@ -141,6 +133,15 @@ def record_reason(transfer: CellTransfer, reason: str) -> None:
     transfer.reason = reason
 
 
+def record_unanswered(transfer: CellTransfer, reason: str) -> None:
+    """Record the reason, and the members that have not promised or accepted the plan."""
+    issuing = transfer.phase is BallotPhase.ISSUING
+    answers = transfer.accepted if issuing else transfer.promises
+    transfer.unanswered = tuple(name for name in transfer.roster if name not in answers)
+    awaited = first_names(transfer.unanswered, MAX_NAMED)
+    transfer.reason = f"{reason}, and {awaited} did not answer"
+
+
 _PREPARING, _PLANNING, _ISSUING = UNFINISHED
 _WAITING, _ABORTED = (_PREPARING, _ISSUING), BallotPhase.ABORTED
 
@@ -152,7 +153,7 @@ TRANSFER_RULES: RuleBook = RuleBook(
         *PLAN_RULES,
         Transition("L5", FAILED, (_PLANNING,), (), (record_reason,), _ABORTED),
         Transition("L8", MEMBERS, _WAITING, (), (record_reason,), _ABORTED),
-        Transition("L8", TOO_LATE, _WAITING, (), (record_reason,), _ABORTED),
+        Transition("L8", TOO_LATE, _WAITING, (), (record_unanswered,), _ABORTED),
     )
 )
 """Rules L4 to L8 of cell transfers."""

@@ -17,6 +17,7 @@ from laneweave.launch.explain.reasons import reason_of
 from laneweave.launch.explain.story import StoryLine, seconds, story_of, to_dict, wanted
 from laneweave.launch.recordings.runs import scenario_of
 from laneweave.protocol.errors import BadInputError, unknown_name
+from laneweave.protocol.names import span_of
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.wire import events as kinds
 from laneweave.sim_bridge.recording.missed_lanes import leaderless_after_s
@@ -77,7 +78,7 @@ def explain(folder: Path, vehicle: str) -> Explanation:
     entered = {str(event["vehicle"]) for event in events if event["kind"] == kinds.ENTERED}
     known = sorted(entered.union(trips))
     if vehicle not in known:
-        span = f"{known[0]} to {known[-1]}" if known else "none has arrived"
+        span = span_of(known) if known else "none has arrived"
         raise unknown_name("VEHICLE", vehicle, known, f"a vehicle of the run ({span})")
     facts = facts_of(events, vehicle, leaderless_after_s(_scenario(folder)))
     fate, reason, text = _conclusion(facts)

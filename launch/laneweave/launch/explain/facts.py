@@ -103,7 +103,7 @@ class Facts:
     unanswered: bool = False
     """Whether it had not answered its last ballot when a plan did not lead it to its lane."""
     silent_until_s: float = -math.inf
-    """When a ballot was given up last because it had not answered."""
+    """When the last ballot was aborted that it had not answered."""
     slot_planned_s: float = -math.inf
     """Time of the newest plan of a slot."""
     late_slots: int = 0

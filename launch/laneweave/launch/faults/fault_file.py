@@ -26,6 +26,7 @@ from laneweave.protocol.errors import (
     unknown_name,
 )
 from laneweave.protocol.field_validators import one_of, within
+from laneweave.protocol.names import span_of
 from laneweave.protocol.runtime.message_faults import SENDERS, MessageRule
 from laneweave.protocol.structuring import NumberOrRange, structure
 
@@ -433,10 +434,7 @@ def _unknown_targets(
 def _or_a_vehicle(kinds: Collection[str], vehicles: Collection[str] | None) -> str:
     """Return the allowed targets as text."""
     text = f"{', '.join(kinds)}, or the name of a vehicle of the run"
-    if not vehicles:
-        return text
-    in_order = sorted(vehicles, key=lambda name: (len(name), name))
-    return f"{text}: {in_order[0]} to {in_order[-1]}"
+    return f"{text}: {span_of(vehicles)}" if vehicles else text
 
 
 def _source(choice: Path | str, name: str) -> SourceFile:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from typing import Any
 
 from attrs import field, frozen
 
@@ -21,7 +22,6 @@ BRIDGE, COORDINATOR, FLEET, AGENT = (
 )
 
 
-ROLLING = "rolling"
 UNPLANNED_S = 20.0
 """Road time for which a closed formation, or a vehicle that may move, may be without a plan."""
 
@@ -128,17 +128,20 @@ class Observed:
         settings = self.view.processes.settings.get((BRIDGE, BRIDGE, self.view.bridge))
         if settings is None:
             return None
+
+        def value(name: str) -> Any:  # noqa: ANN401 (any JSON)
+            return json.loads(settings.values[name])
+
         try:
-            values = {name: json.loads(text) for name, text in settings.values.items()}
-            if values["formation.operation"] != ROLLING or values["exit"]:
+            if value("formation.operation") != "rolling" or value("exit"):
                 return None
-            speed_mps = float(values["formation.speed_mps"])
+            speed_mps = float(value("formation.speed_mps"))
             begin_m = first_moves_m(
-                float(values["road.s1_m"]),
-                float(values["road.s2_m"]),
+                float(value("road.s1_m")),
+                float(value("road.s2_m")),
                 speed_mps,
-                float(values["formation.settle_s"]),
-                in_s2=bool(values["formation.sort_in_s2"]),
+                float(value("formation.settle_s")),
+                in_s2=bool(value("formation.sort_in_s2")),
             )
         except (KeyError, OverflowError, TypeError, ValueError):
             return None  # of another release

@@ -41,7 +41,7 @@ LONG_INSTANCES = (27,)
 """Instances that TAPPA solves in 8 s; it solves most others in less than 0.1 s."""
 MORE_INSTANCES = 1_600
 MORE_LIMIT_S = 500.0
-"""The oracle takes 130 s for instance 424, on a machine that does nothing else."""
+"""The oracle takes 130 s for instance 424, on an idle machine."""
 FORMATION_INSTANCES = 100
 LARGE_INSTANCES = 100
 CLOSING_INSTANCES = 60

@@ -143,7 +143,7 @@ def test_plans_of_the_rolling_operation(tmp_path: Path) -> None:
     found = explained(tmp_path, [*start, given_up(13.0, [V]), slots[2], *off])
     assert found.reason == Reason.NO_ANSWER
     assert "accepted none of the plans" in found.text
-    # Others did not answer, or an earlier ballot was given up.
+    # Another vehicle did not answer, or it was an earlier ballot that was aborted.
     for event in (given_up(13.0, [W]), given_up(12.0, [V])):
         found = explained(tmp_path, [*start, event, slots[2], *off])
         assert found.reason == Reason.NO_ROOM

@@ -264,7 +264,7 @@ def test_vehicles_of_the_rolling_operation_in_no_plan(
     listener.settings("bridge", "bridge", BRIDGE, settings)
     nothing = [("nothing-planned", "coordinator c1")]
     assert rules(found(listener)) == ([] if planned else nothing)
-    # From a ramp: they have entered just now.
+    # Vehicles that have just entered, from a ramp, may still get a plan.
     listener.census(1202, (), **dict.fromkeys(names, 110.0))
     assert rules(found(listener)) == []
 
