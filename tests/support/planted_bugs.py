@@ -266,6 +266,7 @@ NOT_A_SAFETY_MATTER: Mapping[Function, str] = {
     transfer.record_outbid: "it only says why the ballot was given up",
     transfer.record_restart: "likewise",
     transfer.record_reason: "likewise",
+    transfer.record_unanswered: "likewise",
 }
 """Guards and actions that no bug is planted in, and why."""
 
