@@ -1,12 +1,11 @@
 """Compare the tracker with other solvers: `python benchmarks/tracker_solvers.py`.
 
-All solvers get the same recorded problems, the ticks of an episode in order, since most of them
-start from the solution of the previous tick. Episodes are those of `laneweave bench tracker`,
-driven with `tracking.always_solve`:
+All solvers get the same recorded problems, the ticks of an episode in order, since some of them
+start from the solution of the previous tick. Episodes are those of `laneweave bench tracker`:
 
     tracker     the whole call of the tracker
-    no-shortcut the same with `tracking.always_solve`: OSQP runs at every tick
-    osqp        the program alone: bounds replaced, solved, answer checked
+    shortcut    the same with `tracking.shortcut`: OSQP runs only where a constraint binds
+    osqp        the program alone, from the previous solution: bounds, solve, check of the answer
     daqp        the same program without its states, by a dual active-set method
     lq          the same program without its inequalities, a matrix times a vector: the lower bound
 
@@ -144,7 +143,6 @@ def record(scenario: Scenario, *, instances: int, seed: int) -> Recording:
     Raises:
         RuntimeError: the exact solution of a program was not found.
     """
-    scenario = always_solving(scenario)
     program = Tracker(scenario, scenario.vehicle).program
     parts = Parts.of(program.cost, program.constraints)
     exact = QuadraticProgram(
@@ -176,11 +174,6 @@ def record(scenario: Scenario, *, instances: int, seed: int) -> Recording:
             recording.episodes.append(problems)
             recording.names.append(name)
     return recording
-
-
-def always_solving(scenario: Scenario) -> Scenario:
-    """Return the scenario with `tracking.always_solve`."""
-    return evolve(scenario, tracking=evolve(scenario.tracking, always_solve=True))
 
 
 @frozen(eq=False)
@@ -392,10 +385,10 @@ def compare(
 def solvers(scenario: Scenario, parts: Parts) -> dict[str, Solver]:
     """Return all solvers by name."""
     condensed = Condensed.of(parts)
-    always = always_solving(scenario)
+    shortcut = evolve(scenario, tracking=evolve(scenario.tracking, shortcut=True))
     return {
         "tracker": TrackerSolver(lambda: Tracker(scenario, scenario.vehicle)),
-        "no-shortcut": TrackerSolver(lambda: Tracker(always, always.vehicle)),
+        "shortcut": TrackerSolver(lambda: Tracker(shortcut, shortcut.vehicle)),
         "osqp": OsqpSolver(parts),
         "daqp": DaqpSolver(parts, condensed),
         "lq": LqSolver(parts, condensed),

@@ -73,9 +73,7 @@ class Episode:
             self.network.add(name, core, scenario.network.realm)
 
     def _make_agent(self, vehicle: Name) -> AgentCore:
-        # With `always_solve`, the bounds that a copy needs would fill the memory.
-        copyable = not self.scenario.tracking.always_solve
-        make_driver = partial(TrackingDriver, stopwatch=_no_time, copyable=copyable)
+        make_driver = partial(TrackingDriver, stopwatch=_no_time)
         return AgentCore(vehicle, self._incarnations.__next__, self.scenario, make_driver)
 
     @property

@@ -12,7 +12,6 @@ from tracker_solvers import (
     Condensed,
     LqSolver,
     Recording,
-    always_solving,
     compare,
     record,
     solvers,
@@ -31,7 +30,7 @@ def recording() -> Recording:
 def test_every_family_and_solver_gets_a_row() -> None:
     rows = compare(SCENARIO, instances=1, seed=3, repeats=1)
     names = list(dict.fromkeys(row["solver"] for row in rows))
-    assert names == ["tracker", "no-shortcut", "osqp", "daqp", "lq"]
+    assert names == ["tracker", "shortcut", "osqp", "daqp", "lq"]
     assert [(row["family"], row["solver"]) for row in rows] == [
         (family, name) for family in FAMILIES for name in names
     ]
@@ -53,7 +52,7 @@ def test_a_recorded_program_is_that_of_its_tick(recording: Recording) -> None:
         states = condensed.drift @ problem.lower[: parts.states] + condensed.drive @ no_input
         values = parts.rows @ np.concatenate([states, no_input])
         np.testing.assert_allclose(values[: parts.states], problem.lower[: parts.states], atol=1e-9)
-        tracker = Tracker(always_solving(SCENARIO), SCENARIO.vehicle)
+        tracker = Tracker(SCENARIO, SCENARIO.vehicle)
         tracker.solve(problem.state, problem.window, problem.gaps)
         assert tracker.program.low.all.tobytes() == problem.lower.tobytes()
         assert tracker.program.high.all.tobytes() == problem.upper.tobytes()

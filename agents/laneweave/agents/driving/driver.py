@@ -95,8 +95,6 @@ class TrackingDriver:
         scenario: Scenario,
         limits: Vehicle,
         stopwatch: Callable[[], float] = time.thread_time,
-        *,
-        copyable: bool = False,
     ) -> None:
         """Make a driver without a reference; call `take_over` first.
 
@@ -104,11 +102,10 @@ class TrackingDriver:
             scenario: lattice, timing, sizes of other vehicles.
             limits: those of the vehicle's type.
             stopwatch: clock [s] that measures how long solves take.
-            copyable: see `TrackingProgram`.
         """
         self._own, self._limits = (scenario, limits), limits
         self._room_ahead_m = scenario.types.room_ahead_m
-        self._tracker = Tracker(scenario, limits, stopwatch, copyable=copyable)
+        self._tracker = Tracker(scenario, limits, stopwatch)
         self._reference: Reference | None = None
         self._settling: Reference | None = None
         """The reference with which the vehicle settles in the cell in which it has entered."""

@@ -15,7 +15,7 @@ import signal
 from typing import Any
 
 import numpy as np
-from attrs import frozen
+from attrs import evolve, frozen
 from numpy.typing import NDArray
 from osqp import ext_builtin
 from scipy import sparse
@@ -137,6 +137,9 @@ class QuadraticProgram:
         triangle.eliminate_zeros()
         triangle.sort_indices()
         constraints_csc.sort_indices()
+        self._all_iterations = _osqp_settings(self._settings)
+        one = evolve(self._settings, max_iter=1, check_termination=1)
+        self._one_iteration = _osqp_settings(one)
         self._solver = ext_builtin.OSQPSolver(
             ext_builtin.CSC(triangle),
             self._zero_x,
@@ -145,7 +148,7 @@ class QuadraticProgram:
             self._upper,
             m,
             n,
-            _osqp_settings(self._settings),
+            self._all_iterations,
         )
 
     def update(self, lower: Vector, upper: Vector) -> None:
@@ -161,21 +164,42 @@ class QuadraticProgram:
 
     def solve(self) -> QPResult:
         """Solve, warm-started from the previous solution."""
+        return self._result(self._run())
+
+    def solve_from(self, x: Vector, multipliers: Vector) -> QPResult:
+        """Solve, starting from x (n,) and the multipliers (m,) of the constraints.
+
+        Nothing of earlier solves matters, unless rho is adaptive. At the optimum, one iteration is
+        enough, after which OSQP tests for termination; then as its settings say.
+        """
+        solver, scale = self._solver, self._scale
+        solver.warm_start(x / scale.unknowns, multipliers / scale.constraints)
+        solver.update_settings(self._one_iteration)
+        iterations = self._run()
+        solver.update_settings(self._all_iterations)
+        if int(solver.info.status_val) != SOLVED:
+            iterations += self._run()
+        return self._result(iterations)
+
+    def _run(self) -> int:
+        """Let OSQP iterate from where it is; return the number of iterations."""
         solver = self._solver
         solver.solve()
         if int(solver.info.status_val) == INTERRUPTED:
             # The signal was meant for the process, not for OSQP.
             signal.raise_signal(signal.SIGINT)
             solver.solve()
-        info = solver.info
-        status = int(info.status_val)
+        return int(solver.info.iter)
+
+    def _result(self, iterations: int) -> QPResult:
+        solver = self._solver
+        status = int(solver.info.status_val)
         scaled: Vector = solver.solution.x
         violation = math.inf
         if status in (SOLVED, SOLVED_INACCURATE, MAX_ITERATIONS):
             violation = self._violation(scaled)
         usable = violation <= self._settings.tolerance
-        x = scaled * self._scale.unknowns
-        result = QPResult(x, usable, status, int(info.iter), violation)
+        result = QPResult(scaled * self._scale.unknowns, usable, status, iterations, violation)
         if not usable:
             self.reset()
         return result

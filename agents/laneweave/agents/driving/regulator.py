@@ -2,8 +2,9 @@
 
 Each axis of a vehicle is a triple integrator (position, speed, acceleration) with constant jerk
 during a tick. With the weights below, the jerks that minimise the cost over an infinite horizon are
-w_k = -K e_k, where K follows from the fixed point of the Riccati recursion. `Regulator` holds
-this solution for a whole horizon as one matrix, with the values of all constraints.
+w_k = -K e_k, where K follows from the fixed point S of the Riccati recursion. The multipliers of
+the dynamics are the gradients of the cost to go, S e_k. `Regulator` holds all of this for a whole
+horizon as matrices times e_0, with the values of all constraints.
 """
 
 from __future__ import annotations
@@ -70,13 +71,16 @@ class Regulator:
         transition, effect = axis_matrices(tick_s)
         inputs = np.zeros((ticks, 2, 6))
         errors = np.zeros((ticks, 6, 6))
+        last = np.zeros((6, 6))
         for axis, weights in enumerate((WEIGHTS, LATERAL_WEIGHTS)):
-            gain = _gain(cost_to_go(weights, tick_s), tick_s)
+            to_go = cost_to_go(weights, tick_s)
+            gain = _gain(to_go, tick_s)
             block, error = slice(3 * axis, 3 * axis + 3), np.eye(3)
             for k in range(ticks):
                 inputs[k, axis, block] = (-gain @ error)[0]
                 error = (transition - effect @ gain) @ error
                 errors[k, block, block] = error
+            last[block, block] = to_go
         self.constraints: Array = np.concatenate(
             [
                 errors[:, 1],
@@ -92,6 +96,10 @@ class Regulator:
         order of `tracking_problem.ConstraintBounds`."""
         self.inputs = np.ascontiguousarray(self.constraints[5 * ticks : 7 * ticks])
         """Matrix (2 N, 6) from e_0 to the jerks."""
+        self.errors = errors.reshape(6 * ticks, 6)
+        """Matrix (6 N, 6) from e_0 to e_1 .. e_N."""
+        self.multipliers = (last @ errors).reshape(6 * ticks, 6)
+        """Matrix (6 N, 6) from e_0 to the multipliers of the dynamics."""
         self._ticks = ticks
 
     def unconstrained_errors(self, limits: Vehicle, speed_mps: float) -> tuple[float, ...]:

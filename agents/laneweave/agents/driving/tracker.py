@@ -3,9 +3,11 @@
 At each tick it solves the quadratic program of `tracking_problem` for the commanded state
 (`protocol.vehicle.motion`), which compensates for actuator lag.
 
-**Fast path.** Without active inequality constraints, the solution is the regulator's,
-w_k = -K e_k. Jerks and values of all constraints are one precomputed matrix times e_0. If they
-satisfy all constraints, OSQP does not run, unless `tracking.always_solve` is set.
+OSQP starts from the regulator's solution, w_k = -K e_k, which is optimal if no inequality
+constraint binds, and ends after one iteration then.
+
+**Shortcut** (`tracking.shortcut`, for sweeps). Jerks and values of all constraints are one
+precomputed matrix times e_0. If they satisfy all constraints, OSQP does not run.
 
 **Other references.** A reference that runs into the vehicle ahead yields
 (`reference.yield_behind`). Far from the reference (for example after an emergency brake), or
@@ -52,7 +54,7 @@ class TrackResult:
     usable: bool
     """Whether `jerk` may be executed; otherwise the last usable result continues."""
     iterations: int
-    """Iterations of OSQP; 0 on the fast path."""
+    """Iterations of OSQP; 0 with the shortcut."""
     solve_ms: float
     """CPU time of the calling thread [ms], including the set-up of OSQP at its first use."""
     violation: float
@@ -67,16 +69,13 @@ class Tracker:
         scenario: Scenario,
         limits: Vehicle,
         stopwatch: Callable[[], float] = time.thread_time,
-        *,
-        copyable: bool = False,
     ) -> None:
-        """Prepare the program, and the fast path unless `tracking.always_solve` is set.
+        """Prepare the program, and the shortcut if `tracking.shortcut` is set.
 
         Args:
             scenario: tick, horizon.
             limits: those of the vehicle.
             stopwatch: clock [s] that measures how long solves take.
-            copyable: see `TrackingProgram`.
         """
         self._stopwatch = stopwatch
         n = self._n = scenario.timing.horizon_ticks
@@ -85,17 +84,15 @@ class Tracker:
         self._limits = limits
         self._shapes = (n + 1, 6), (n, 2)
         self._kept = np.empty(14 * n, dtype=np.bool_)
-        """Buffer for comparisons with bounds on the fast path; its blocks follow as views."""
+        """Buffer for comparisons with bounds for the shortcut; its blocks follow as views."""
         kept = self._kept
         self._kept_low, self._kept_high = kept[: 10 * n].reshape(2, 5, n)
         self._kept_low_jerk, self._kept_high_jerk = kept[10 * n :].reshape(2, n, 2)
-        self.program = TrackingProgram(scenario, limits, copyable=copyable)
+        self.program = TrackingProgram(scenario, limits)
         self._regulator = None
         self.unconstrained_errors: tuple[float, ...] = ()
         """Errors up to which no constraint binds while a cell is held."""
-        if scenario.tracking.always_solve:
-            self.program.set_up()
-        else:
+        if scenario.tracking.shortcut:
             self._regulator = shared_regulator(n, self._tick_s, limits.max_slip_ratio)
             self.unconstrained_errors = self._regulator.unconstrained_errors(
                 limits, scenario.formation.speed_mps
@@ -124,11 +121,10 @@ class Tracker:
         if usable:
             jerk = self._regulated(error, target, gaps)
             if jerk is not None:
-                program.discard_solution()
                 elapsed_ms = (self._stopwatch() - start) * 1e3
                 return TrackResult(jerk, True, 0, elapsed_ms, 0.0)
             program.write_bounds(error, target.states, target.jerks, target.defect, gaps)
-            result = program.solve()
+            result = program.solve(error)
             usable, iterations = result.usable, result.iterations
         if not usable:
             back = self._path_back(commanded, window.states)
@@ -136,7 +132,7 @@ class Tracker:
             error = _error(commanded, target)
             program.write_bounds(error, target.states, target.jerks, target.defect, gaps)
             program.admit_zero()
-            result = program.solve()
+            result = program.solve(error)
             usable, iterations = result.usable, iterations + result.iterations
         if usable:
             jerk = self._limited(commanded, target.jerks + program.jerks(result))
@@ -174,7 +170,6 @@ class Tracker:
         a_y = commanded[5] - goal[5]
         if not -max_ay <= a_y <= max_ay:
             return None
-        self.program.discard_solution()
         jerk = self._regulator.inputs.dot((s, v, a, y, v_y, a_y)).reshape(-1, 2)
         return TrackResult(jerk, True, 0, (self._stopwatch() - start) * 1e3, 0.0)
 

@@ -32,6 +32,7 @@ from laneweave.agents.driving.regulator import (
     WEIGHTS,
     axis_matrices,
     cost_to_go,
+    shared_regulator,
 )
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.vehicle_tables import Vehicle
@@ -40,7 +41,7 @@ from laneweave.protocol.vehicle.motion import State, integrate
 Array = NDArray[np.float64]
 
 _GAP_WEIGHT = 10.0
-# With a fixed rho the warm start is the only state, so a reset is complete.
+# With a fixed rho, a solve depends only on where it starts. Most need one iteration.
 SETTINGS = QPSettings(
     eps_abs=6e-3,
     max_iter=100,
@@ -156,17 +157,12 @@ class ConstraintBounds:
 class TrackingProgram:
     """The quadratic program of one vehicle; its bounds change at each tick."""
 
-    def __init__(self, scenario: Scenario, limits: Vehicle, *, copyable: bool = False) -> None:
+    def __init__(self, scenario: Scenario, limits: Vehicle) -> None:
         """Prepare the bounds; OSQP is set up on first use.
-
-        Most vehicles never need OSQP, and its set-up takes as long as hundreds of ticks.
 
         Args:
             scenario: tick, horizon.
             limits: those of the vehicle.
-            copyable: whether the program can be pickled after a solve. It then keeps the bounds of
-                all solves since the last cold start, which a copy repeats: OSQP's iterates cannot
-                be read.
         """
         n = self._n = scenario.timing.horizon_ticks
         self._tick_s = scenario.runtime.tick_s
@@ -181,55 +177,35 @@ class TrackingProgram:
         self.low, self.high = _initial_bounds(n)
         self._gaps = NO_GAPS
         self._qp: QuadraticProgram | None = None
-        self._stale = False
-        self._solved: list[tuple[Array, Array]] | None = [] if copyable else None
-        """Bounds of the solves since the last cold start; None: not kept."""
+        self._regulator = shared_regulator(n, self._tick_s, limits.max_slip_ratio)
+        self._start, self._multipliers = np.zeros(9 * n), np.zeros(14 * n)
+        """Where OSQP starts; slacks and the multipliers of inequalities stay zero."""
 
-    def discard_solution(self) -> None:
-        """Cold-start the next solve."""
-        self._stale = True
+    def solve(self, error: State) -> QPResult:
+        """Solve with the most recently written bounds, starting from the regulator's solution.
 
-    def solve(self) -> QPResult:
-        """Solve with the most recently written bounds."""
+        If no inequality binds, this is the solution, and OSQP ends after one iteration. Nothing of
+        earlier solves matters.
+
+        Args:
+            error: e_0, as in `write_bounds`.
+        """
         qp = self._qp
         if qp is None:
             qp = self.set_up()
-        if self._stale:
-            qp.reset()
-            self._stale = False
-            self._forget_solves()
         qp.update(self.low.all, self.high.all)
-        result = qp.solve()
-        if not result.usable:  # the next solve is a cold start
-            self._forget_solves()
-        elif self._solved is not None:
-            self._solved.append((self.low.all.copy(), self.high.all.copy()))
-        return result
-
-    def _forget_solves(self) -> None:
-        if self._solved is not None:
-            self._solved.clear()
+        n, regulator = self._n, self._regulator
+        regulator.errors.dot(error, out=self._start[: 6 * n])
+        regulator.inputs.dot(error, out=self._start[6 * n : 8 * n])
+        regulator.multipliers.dot(error, out=self._multipliers[: 6 * n])
+        return qp.solve_from(self._start, self._multipliers)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the state without OSQP's.
+        """Return the state without OSQP's, which is set up again on first use.
 
         Views of arrays must stay views (`ConstraintBounds`), as with `laneweave.env.copies`.
-
-        Raises:
-            TypeError: OSQP is set up, and the program is not copyable.
         """
-        if self._qp is not None and self._solved is None:
-            raise TypeError("cannot pickle a TrackingProgram without copyable=True")
         return self.__dict__ | {"_qp": None}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        """Restore the state, and OSQP's by repeating its solves."""
-        self.__dict__.update(state)
-        if self._solved and not self._stale:
-            qp = self.set_up()
-            for low, high in self._solved:
-                qp.update(low, high)
-                qp.solve()
 
     def set_up(self) -> QuadraticProgram:
         """Set up OSQP with initial bounds; results then do not depend on the time of the set-up."""

@@ -5,14 +5,14 @@ from __future__ import annotations
 import copy
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import attrs
 
 from laneweave.protocol.config import demand_checks, deployment_checks, motion_checks, road_checks
 from laneweave.protocol.config.source_files import read_toml_source
 from laneweave.protocol.errors import BadInputError, raise_all
-from laneweave.protocol.scenario.deployment_fields import FORMER_SERVICE_FIELDS, Security
+from laneweave.protocol.scenario.deployment_fields import Security
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.formation_table import PAPERS_FORMATIONS
 from laneweave.protocol.structuring import structure
@@ -40,6 +40,12 @@ _CHECKS = (
 )
 """Checks in the order in which they run. One may use what those before it in its group have
 established, so that a group reports its first error only; the groups are independent."""
+
+FORMER_FIELDS: Final[Mapping[str, frozenset[str]]] = {
+    "service": frozenset({"cache_entries", "cache_s"}),
+    "tracking": frozenset({"always_solve"}),
+}
+"""Fields of tables in earlier files, which are ignored."""
 
 
 def load_scenario(path: Path | None, **overrides: object) -> Scenario:
@@ -118,13 +124,15 @@ def _with_current_names(data: Mapping[str, Any]) -> Mapping[str, Any]:
     """Return the tables without former fields, and with current ones for `operation = "paper"`."""
     if not isinstance(data, Mapping):
         return data
-    formation, service = data.get("formation"), data.get("service")
+    formation = data.get("formation")
     if isinstance(formation, Mapping) and formation.get("operation") == "paper":
         current = {**PAPERS_FORMATIONS, **formation, "operation": "formations"}
         data = {**data, "formation": current}
-    if isinstance(service, Mapping) and not FORMER_SERVICE_FIELDS.isdisjoint(service):
-        kept = {name: value for name, value in service.items() if name not in FORMER_SERVICE_FIELDS}
-        data = {**data, "service": kept}
+    for table, former in FORMER_FIELDS.items():
+        fields = data.get(table)
+        if isinstance(fields, Mapping) and not former.isdisjoint(fields):
+            kept = {name: value for name, value in fields.items() if name not in former}
+            data = {**data, table: kept}
     return data
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Mapping
-from typing import Any, Final
+from typing import Any
 
 import attrs
 from attrs import field, frozen
@@ -128,10 +128,6 @@ class Security:
     """Processes that may query the planning service."""
     observers: tuple[str, ...] = field(default=("ping", "status", "watch"), validator=key_parts)
     """Processes that may only subscribe."""
-
-
-FORMER_SERVICE_FIELDS: Final = frozenset({"cache_entries", "cache_s"})
-"""Fields of the table `service` in earlier files, which are ignored."""
 
 
 @frozen

@@ -101,9 +101,9 @@ class Tracking:
     """Horizon of the tracker; None: the longest T_F."""
     min_gap_m: float = field(default=3.0, validator=within(0.0, 100.0))
     """Minimum net gap to the vehicle ahead; takes precedence over the reference."""
-    always_solve: bool = False
-    """Solve the quadratic program with OSQP in every tick, even if its unconstrained solution
-    satisfies all constraints."""
+    shortcut: bool = False
+    """Use the unconstrained solution of the quadratic program without OSQP where it satisfies all
+    constraints: the same jerks (within 1e-3 m/s3) in less time, for sweeps."""
 
 
 @frozen

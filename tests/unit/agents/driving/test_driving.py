@@ -45,20 +45,20 @@ def test_equal_seeds_give_equal_switches() -> None:
 
 
 def test_osqp_in_every_tick_drives_the_same_trajectories() -> None:
-    """`tracking.always_solve` changes where the answer comes from, not the answer."""
-    always = attrs.evolve(SCENARIO, tracking=attrs.evolve(SCENARIO.tracking, always_solve=True))
+    """`tracking.shortcut` changes where the answer comes from, not the answer."""
+    shortcut = attrs.evolve(SCENARIO, tracking=attrs.evolve(SCENARIO.tracking, shortcut=True))
     moves: dict[int, dict[Name, PlannedMove]] = {
         20: {ME: (1, (0, 1), (0, 0))},
         80: {OTHER: (1, (1, 1), (0, 1))},
     }
     driven = []
-    for scenario in (SCENARIO, always):
+    for scenario in (SCENARIO, shortcut):
         road = Road(scenario, {ME: (0, 1), OTHER: (1, 1)})
         for tick in range(150):
             road.step(moves.get(tick))
         efforts = [one.driver.solver_stats for one in road.driven.values()]
         assert [effort.solves for effort in efforts] == [150, 150]
-        expected = 150 if scenario.tracking.always_solve else 0
+        expected = 0 if scenario.tracking.shortcut else 150
         assert [effort.osqp_solves for effort in efforts] == [expected, expected]
         driven.append(np.array(road.record.states))
     # OSQP's tolerance is 6e-3 m/s3.

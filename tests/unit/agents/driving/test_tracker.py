@@ -22,7 +22,7 @@ from support.examples import examples
 from support.tables import for_each
 
 SCENARIO = Scenario()
-ALWAYS = evolve(SCENARIO, tracking=evolve(SCENARIO.tracking, always_solve=True))
+SHORTCUT = evolve(SCENARIO, tracking=evolve(SCENARIO.tracking, shortcut=True))
 LIMITS = SCENARIO.vehicle
 LATTICE = SCENARIO.lattice
 TICK_S = SCENARIO.runtime.tick_s
@@ -274,7 +274,7 @@ def test_a_distant_vehicle_changes_nothing(distance: float) -> None:
 
 
 @pytest.mark.parametrize("side", ["ahead", "behind"])
-@pytest.mark.parametrize("scenario", [SCENARIO, ALWAYS])
+@pytest.mark.parametrize("scenario", [SCENARIO, SHORTCUT])
 def test_gap_rows_leave_nothing_behind(scenario: Scenario, side: str) -> None:
     window = Reference.hold(SCENARIO, LIMITS, (0, 1)).window(0)
     state = cell_state(LATTICE, (0, 1), 0.0)

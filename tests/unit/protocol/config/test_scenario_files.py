@@ -91,7 +91,8 @@ def test_a_recording_of_the_paper_s_operation_under_its_earlier_name_is_read() -
         for name, value in tables["formation"].items()
         if name not in ("entry", "close", "max_columns")
     }
-    recording = tables | {"formation": kept | earlier, "tracking": {"horizon_ticks": 40}}
+    tracked = {"horizon_ticks": 40, "always_solve": True}
+    recording = tables | {"formation": kept | earlier, "tracking": tracked}
     recording["service"] = tables["service"] | {"cache_entries": 1024, "cache_s": 60.0}
     expected = load_scenario(FOLDER / "paper.toml")
     tracking = attrs.evolve(expected.tracking, horizon_ticks=40)

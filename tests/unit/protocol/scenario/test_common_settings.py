@@ -45,7 +45,7 @@ SINGLE_ROLE_FIELDS = {
     "formation.conflicts": "coordinator; vehicles check the footprints of a plan themselves",
     "formation.reward_drift": "coordinator",
     "tracking.horizon_ticks": "agent",
-    "tracking.always_solve": "agent",
+    "tracking.shortcut": "agent",
     "runtime.tick_resend_s": "bridge",
     "runtime.tick_deadline_s": "bridge",
     "runtime.agent_silent_s": "bridge",
