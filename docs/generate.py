@@ -768,7 +768,7 @@ def _stability() -> str:
     """Return the table of how a speed disturbance propagates, by `benchmarks/stability.py`."""
     headings = (
         "", "speed lost, messages lost", "disturbed", "1st behind", "2nd behind", "last",
-        "amplification", "any behind", "the last", "braked", "min. gap",
+        "amplification", "any behind", "the last", "braked", "back after", "min. gap",
     )  # fmt: skip
     lines = [f"| {' | '.join(headings)} |", "|---" * len(headings) + "|"]
     for row in json.loads(STABILITY.read_text(encoding="utf-8"))["rows"]:
@@ -782,7 +782,7 @@ def _stability() -> str:
         lines.append(
             f"| {row['formation']} | {row['drop_mps']:g} m/s, {100 * row['loss']:g} % | {cells} "
             f"| {low_high} | {row['travelled']} {of} | {row['reached_last']} {of} "
-            f"| {row['braked']} | {row['least_gap_m']:.2f} m |"
+            f"| {row['braked']} | {row['back_s']:.1f} s | {row['least_gap_m']:.2f} m |"
         )
     return "\n".join(lines)
 

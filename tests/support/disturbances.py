@@ -8,12 +8,15 @@ point of its cell, or the trajectory of the move under way.
 
 `column`: one lane, vehicles in consecutive cells, all on the lane that they need. The foremost one
 is disturbed while all hold their cells.
-`switching`: three lanes; vehicles change to the lanes that they need. The first one that changes
-lanes is disturbed in the middle of it.
+`switching`: three lanes, the paper's formations; vehicles change to the lanes that they need. The
+first one that changes lanes is disturbed in the middle of it.
+`rolling`: likewise in the rolling operation, at 2000 vehicles/(lane h).
 """
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -28,7 +31,7 @@ from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.vehicle_tables import Vehicle
 from laneweave.protocol.transports.simulated.virtual_time import Conditions
-from laneweave.protocol.vehicle.motion import State, cell_state
+from laneweave.protocol.vehicle.motion import ARRIVED_ALONG_M, State, cell_state
 from laneweave.protocol.wire.messages import Name
 from laneweave.sim_bridge.bodies.motion_controller import FallbackLevel, MotionController
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import Bodies, pose_of
@@ -38,12 +41,13 @@ from support.bridge_bench import Street
 
 Array = NDArray[np.float64]
 
-FORMATIONS = ("column", "switching")
+FORMATIONS = ("column", "switching", "rolling")
 BRAKING_S = 2.0
-MEASURED_S = 15.0
-"""From the beginning of the disturbance."""
+MEASURED_S = {"column": 30.0, "switching": 15.0, "rolling": 20.0}
+"""Time measured from the beginning of the disturbance."""
 HOLDING_S = 5.0
 """The column holds for this long before the disturbance."""
+ROLLING_VEH_PER_LANE_H = 2000.0
 IN_MOVE_S = 1.0
 """A lane change is this old when its vehicle is disturbed."""
 
@@ -67,11 +71,10 @@ class Case:
         Only the rolling operation lets vehicles enter consecutive cells of a lane; the switching
         formations are the paper's.
         """
-        tables: dict[str, dict[str, Any]] = (
-            {"road": {"lanes": 1}, "formation": {"operation": "rolling"}}
-            if self.formation == "column"
-            else {"formation": {"operation": "paper"}}
-        )
+        operation = "paper" if self.formation == "switching" else "rolling"
+        tables: dict[str, dict[str, Any]] = {"formation": {"operation": operation}}
+        if self.formation == "column":
+            tables["road"] = {"lanes": 1}
         return parse_scenario({"seed": self.seed, **tables})
 
     def arrivals(self) -> list[Arrival]:
@@ -79,14 +82,19 @@ class Case:
         scenario = self.scenario
         lanes, spacing_s = scenario.road.lanes, scenario.formation.entry_spacing_s
         rng = np.random.default_rng(self.seed)
+        cells: Iterator[int] = itertools.count()
+        if self.formation == "rolling":
+            share = ROLLING_VEH_PER_LANE_H * spacing_s / 3600.0
+            draws = np.random.default_rng([self.seed, 1])
+            cells = (cell for cell in cells if draws.random() < share)
         return [
             Arrival(
                 f"v{number + 1:02}",
-                number % lanes,
+                cell % lanes,
                 int(rng.integers(lanes)),
-                (number // lanes + 1) * spacing_s,
+                (cell // lanes + 1) * spacing_s,
             )
-            for number in range(self.vehicles)
+            for number, cell in enumerate(itertools.islice(cells, self.vehicles))
         ]
 
 
@@ -161,6 +169,12 @@ class Response:
     moves: int
     """Moves that began while it was measured."""
 
+    @property
+    def back_s(self) -> float:
+        """Time from which all bodies are within reach of the reference, and stay there."""
+        away = (np.abs(self.position_m) > ARRIVED_ALONG_M).any(axis=1)
+        return float(self.times_s[np.flatnonzero(away)[-1]]) if away.any() else 0.0
+
 
 @define
 class _Run:
@@ -202,7 +216,7 @@ class _Run:
         plant.forced_mps2 = -drop_mps / BRAKING_S if drop_mps and since_s < BRAKING_S else None
         self.rows.append(row)
         self._watch()
-        self._over = since_s >= MEASURED_S
+        self._over = since_s >= MEASURED_S[self.case.formation]
         return self._over
 
     def _begin(self) -> None:

@@ -17,7 +17,13 @@ import numpy as np
 import pytest
 from numpy.random import default_rng
 
-from laneweave.agents.driving.tracking_problem import NO_GAPS, ConstraintBounds, TrackingProgram
+from laneweave.agents.driving.tracking_problem import (
+    NO_GAPS,
+    SETTINGS,
+    ConstraintBounds,
+    TrackingProgram,
+    shared_program,
+)
 from laneweave.env import VehiclesEnv, parallel_env
 from laneweave.env.copies import dumped, loaded
 from laneweave.protocol.scenario.fields import Scenario
@@ -82,20 +88,21 @@ def test_a_copy_in_an_episode_continues_exactly_as_the_original(make: Copy, step
     assert same(rest(again, rng), of_original)
 
 
-def test_a_program_continues_to_the_bit() -> None:
+def test_copies_share_the_program_and_solves_do_not_depend_on_earlier_ones() -> None:
     scenario = Scenario()
-    program = TrackingProgram(scenario, scenario.vehicle)
-    n = scenario.timing.horizon_ticks
+    n, tick_s = scenario.timing.horizon_ticks, scenario.runtime.tick_s
+    program = shared_program(n, tick_s, scenario.vehicle)
+    assert loaded(dumped(program)) is program
     states, jerks = np.zeros((n + 1, 6)), np.zeros((n, 2))
     states[:, 1] = 15.0
     rng = default_rng(2)
     iterations = set()
     for spread in (0.3, 3.0) * 6:
         error = tuple(rng.normal(0.0, spread, 6).tolist())
-        copied = loaded(dumped(program))
-        for one in (program, copied):
+        new = TrackingProgram(n, tick_s, scenario.vehicle, SETTINGS)
+        for one in (program, new):
             one.write_bounds(error, states, jerks, None, NO_GAPS)
-        expected, got = program.solve(error), copied.solve(error)
+        expected, got = new.solve(error), program.solve(error)
         assert expected.iterations == got.iterations
         assert expected.x.tobytes() == got.x.tobytes()
         iterations.add(expected.iterations)

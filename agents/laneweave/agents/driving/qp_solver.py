@@ -15,7 +15,7 @@ import signal
 from typing import Any
 
 import numpy as np
-from attrs import evolve, frozen
+from attrs import define, evolve, frozen
 from numpy.typing import NDArray
 from osqp import ext_builtin
 from scipy import sparse
@@ -25,6 +25,7 @@ Vector = NDArray[np.float64]
 SOLVED = 1
 SOLVED_INACCURATE = 2
 MAX_ITERATIONS = 7
+_WITH_SOLUTION = (SOLVED, SOLVED_INACCURATE, MAX_ITERATIONS)
 INTERRUPTED = 10
 """Status after OSQP has caught a SIGINT."""
 
@@ -68,7 +69,7 @@ class QPScale:
     """Positive units (n,) of x, also used for the gradient."""
 
 
-@frozen
+@define(eq=False)  # created at each tick: frozen objects take three times as long
 class QPResult:
     """Result of one solve."""
 
@@ -80,7 +81,8 @@ class QPResult:
     """OSQP's status: 1 solved, 2 inaccurate, 7 out of iterations; others: no solution."""
     iterations: int
     violation: float
-    """Maximum violation of a constraint by x; infinite without a solution."""
+    """Maximum violation of a constraint by x, or an upper bound of it; infinite without a
+    solution."""
 
 
 class QuadraticProgram:
@@ -117,6 +119,7 @@ class QuadraticProgram:
             raise ValueError(f"cost has shape {cost.shape}, but there are {n} unknowns")
         self._settings = settings or QPSettings()
         self._scale = _checked_scale(scale or QPScale(np.ones(m), np.ones(n)), m, n)
+        self._least_scale = float(self._scale.constraints.min(initial=1.0))
         by_constraints = sparse.diags(self._scale.constraints)
         by_unknowns = sparse.diags(self._scale.unknowns)
         cost_csc = (by_unknowns @ cost @ by_unknowns).tocsc()
@@ -166,14 +169,25 @@ class QuadraticProgram:
         """Solve, warm-started from the previous solution."""
         return self._result(self._run())
 
+    def replace_equalities(self, rows: slice, values: Vector) -> None:
+        """Replace both bounds of some constraints by equal values, which must be finite."""
+        values = values * self._scale.constraints[rows]
+        self._lower[rows] = self._upper[rows] = values
+        if self._solver.update_data_vec(q=None, l=self._lower, u=self._upper):
+            raise ValueError("OSQP refused the vectors")
+
     def solve_from(self, x: Vector, multipliers: Vector) -> QPResult:
         """Solve, starting from x (n,) and the multipliers (m,) of the constraints.
 
         Nothing of earlier solves matters, unless rho is adaptive. At the optimum, one iteration is
         enough, after which OSQP tests for termination; then as its settings say.
+
+        Args:
+            x: in the units of the scale, x / `QPScale.unknowns`.
+            multipliers: likewise, divided by `QPScale.constraints`.
         """
-        solver, scale = self._solver, self._scale
-        solver.warm_start(x / scale.unknowns, multipliers / scale.constraints)
+        solver = self._solver
+        solver.warm_start(x, multipliers)
         solver.update_settings(self._one_iteration)
         iterations = self._run()
         solver.update_settings(self._all_iterations)
@@ -196,7 +210,10 @@ class QuadraticProgram:
         status = int(solver.info.status_val)
         scaled: Vector = solver.solution.x
         violation = math.inf
-        if status in (SOLVED, SOLVED_INACCURATE, MAX_ITERATIONS):
+        if status == SOLVED:
+            # A bound: OSQP measures the violation where it terminates.
+            violation = float(solver.info.prim_res) / self._least_scale
+        if not violation <= self._settings.tolerance and status in _WITH_SOLUTION:
             violation = self._violation(scaled)
         usable = violation <= self._settings.tolerance
         result = QPResult(scaled * self._scale.unknowns, usable, status, iterations, violation)

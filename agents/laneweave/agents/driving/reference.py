@@ -10,7 +10,8 @@ import numpy as np
 from attrs import define
 from numpy.typing import NDArray
 
-from laneweave.agents.driving.tracking_problem import ErrorBounds
+from laneweave.agents.driving.stopping_points import StoppingPoints
+from laneweave.agents.driving.tracking_problem import ErrorBounds, Gaps
 from laneweave.agents.driving.trajectory import Trajectory, move_profile, settling_trajectory
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario.fields import Scenario
@@ -42,6 +43,8 @@ class Window:
     """Admissible errors from the next tick on; None: not computed."""
     defect: Array | None = None
     """Violation c (N, 3) of the dynamics along the road; None: zero."""
+    holds: bool = False
+    """Whether the reference holds a cell throughout."""
 
 
 class Reference:
@@ -156,7 +159,8 @@ class Reference:
         """Return the part of the reference from `tick` on; its jerks are read-only."""
         n = self._horizon
         first = tick - self.start_tick + n
-        first = min(max(first, 0), len(self._jerks) - n)
+        last = len(self._jerks) - n
+        first = min(max(first, 0), last)
         states = self._states[first : first + n + 1].copy()
         s = states[:, 0]
         s += self._ramp
@@ -165,17 +169,24 @@ class Reference:
         if bounds is None:
             bounds = ErrorBounds.around(self._states[1:], self._jerks, self._limits)
             self._bounds = bounds
-        return Window(states, self._jerks[first : first + n], bounds.part(first, first + n))
+        jerks = self._jerks[first : first + n]
+        return Window(states, jerks, bounds.part(first, first + n), holds=first == last)
 
 
 def yield_behind(
-    commanded: State, states: Array, jerks: Array, latest_m: Array, tick_s: float, limits: Vehicle
+    commanded: State,
+    states: Array,
+    jerks: Array,
+    gaps: Gaps,
+    points: StoppingPoints,
+    tick_s: float,
+    limits: Vehicle,
 ) -> None:
     """Replace the part of a reference that is beyond the yielding path, in place.
 
     The gap constraints alone would suffice, but the program takes ten times as long if the
     reference is far beyond them. The yielding path is the gentlest constant deceleration from the
-    vehicle's own state that stays behind:
+    vehicle's own state that stays behind, and whose stopping points do (`StoppingPoints`):
 
         d = max over t of 2 (s + v t - latest(t)) / t^2
 
@@ -189,15 +200,20 @@ def yield_behind(
         commanded: commanded state of the vehicle.
         states: states of the reference (N + 1, 6).
         jerks: jerks of the reference (N, 2).
-        latest_m: upper bounds (N + 1,) on the front bumper; +inf for none.
+        gaps: bounds set by vehicles ahead.
+        points: stopping points of the vehicle.
         tick_s: length of the tick [s].
         limits: the vehicle's limits.
     """
     s, v = commanded[0], max(commanded[1], 0.0)
-    first = min(round(_REACT_S / tick_s), len(jerks))
-    t = tick_s * np.arange(first, len(states))
-    needed = 2.0 * (s + v * t - latest_m[first:] + _BUFFER_M) / (t * t)
-    decel = float(needed.max())
+    decel = -np.inf
+    if gaps.latest is not None:
+        first = min(round(_REACT_S / tick_s), len(jerks))
+        t = tick_s * np.arange(first, len(states))
+        needed = 2.0 * (s + v * t - gaps.latest[first:] + _BUFFER_M) / (t * t)
+        decel = float(needed.max())
+    if gaps.stopping is not None:
+        decel = max(decel, points.needed_decel_mps2(commanded, gaps.stopping))
     decel = min(decel, -_BRAKE_SHARE * limits.min_accel_mps2)
     decel = max(decel, -_ACCEL_SHARE * limits.max_accel_mps2)
     now, path, inputs = commanded, [commanded], []

@@ -23,6 +23,8 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
+from functools import cache
+from threading import get_ident
 
 import numpy as np
 from attrs import define
@@ -30,7 +32,14 @@ from numpy.typing import NDArray
 
 from laneweave.agents.driving.reference import Window, yield_behind
 from laneweave.agents.driving.regulator import axis_matrices, shared_regulator
-from laneweave.agents.driving.tracking_problem import NO_GAPS, ErrorBounds, Gaps, TrackingProgram
+from laneweave.agents.driving.stopping_points import StoppingPoints
+from laneweave.agents.driving.tracking_problem import (
+    NO_GAPS,
+    ErrorBounds,
+    Gaps,
+    TrackingProgram,
+    shared_program,
+)
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.vehicle_tables import Vehicle
 from laneweave.protocol.vehicle.motion import State, hold_law, integrate, limited_jerk
@@ -88,7 +97,12 @@ class Tracker:
         kept = self._kept
         self._kept_low, self._kept_high = kept[: 10 * n].reshape(2, 5, n)
         self._kept_low_jerk, self._kept_high_jerk = kept[10 * n :].reshape(2, n, 2)
-        self.program = TrackingProgram(scenario, limits)
+        self._stopping_points = StoppingPoints(scenario, limits)
+        self._max_jerk = np.array([[limits.max_jerk_mps3], [limits.max_lateral_jerk_mps3]])
+        self._rollout, self._values = _rollout(n, self._tick_s), np.zeros((2, n + 2))
+        self._program: TrackingProgram | None = None
+        self._thread = 0
+        """Thread of the program."""
         self._regulator = None
         self.unconstrained_errors: tuple[float, ...] = ()
         """Errors up to which no constraint binds while a cell is held."""
@@ -97,6 +111,15 @@ class Tracker:
             self.unconstrained_errors = self._regulator.unconstrained_errors(
                 limits, scenario.formation.speed_mps
             )
+
+    @property
+    def program(self) -> TrackingProgram:
+        """The program, shared by the trackers of this thread with the same limits."""
+        program, thread = self._program, get_ident()
+        if program is None or thread != self._thread:
+            program = self._program = shared_program(self._n, self._tick_s, self._limits)
+            self._thread = thread
+        return program
 
     def solve(self, commanded: State, window: Window, gaps: Gaps = NO_GAPS) -> TrackResult:
         """Return the jerks that take a vehicle from its commanded state to its reference.
@@ -114,23 +137,27 @@ class Tracker:
         if gaps is not NO_GAPS:
             gaps.check(self._n)
         program = self.program
-        target = self._yielding(commanded, window, gaps.latest)
+        target = self._yielding(commanded, window, gaps)
+        bounds = self._positions(gaps, target)
         iterations = 0
         error = _error(commanded, target)
         usable = _is_near(error)
         if usable:
-            jerk = self._regulated(error, target, gaps)
+            jerk = self._regulated(error, target, bounds)
             if jerk is not None:
                 elapsed_ms = (self._stopwatch() - start) * 1e3
                 return TrackResult(jerk, True, 0, elapsed_ms, 0.0)
-            program.write_bounds(error, target.states, target.jerks, target.defect, gaps)
+            program.write_bounds(
+                error, target.states, target.jerks, target.defect, bounds, holds=target.holds
+            )
             result = program.solve(error)
             usable, iterations = result.usable, result.iterations
         if not usable:
             back = self._path_back(commanded, window.states)
-            target = self._yielding(commanded, back, gaps.latest)
+            target = self._yielding(commanded, back, gaps)
+            bounds = self._positions(gaps, target)
             error = _error(commanded, target)
-            program.write_bounds(error, target.states, target.jerks, target.defect, gaps)
+            program.write_bounds(error, target.states, target.jerks, target.defect, bounds)
             program.admit_zero()
             result = program.solve(error)
             usable, iterations = result.usable, iterations + result.iterations
@@ -196,16 +223,37 @@ class Tracker:
         answer: Array = target.jerks + free_jerk
         return answer
 
-    def _yielding(self, commanded: State, window: Window, latest: Array | None) -> Window:
+    def _yielding(self, commanded: State, window: Window, gaps: Gaps) -> Window:
         """Return the reference, with a yielding path if it violates a gap."""
-        if latest is None or not (window.states[:, 0] > latest).any():
+        if not self._violates(window.states, gaps):
             return window
-        states, jerks = window.states.copy(), window.jerks.copy()
-        yield_behind(commanded, states, jerks, latest, self._tick_s, self._limits)
+        states, jerks, points = window.states.copy(), window.jerks.copy(), self._stopping_points
+        yield_behind(commanded, states, jerks, gaps, points, self._tick_s, self._limits)
         transition, effect = self._axis
         along = states[:, :3]
         defect = along[:-1] @ transition.T + jerks[:, :1] * effect[:, 0] - along[1:]
         return Window(states, jerks, None, defect)
+
+    def _violates(self, states: Array, gaps: Gaps) -> bool:
+        """Return whether states (N + 1, 6) pass an upper bound."""
+        s, latest, stopping = states[:, 0], gaps.latest, gaps.stopping
+        if latest is not None and (s > latest).any():
+            return True
+        if stopping is None:
+            return False
+        return bool((s + self._stopping_points.distances_m(states) > stopping).any())
+
+    def _positions(self, gaps: Gaps, target: Window) -> Gaps:
+        """Return the gaps with bounds of positions alone.
+
+        Those of stopping points apply at the speeds of the reference, which follow them.
+        """
+        if gaps.stopping is None:
+            return gaps
+        latest = gaps.stopping - self._stopping_points.distances_m(target.states)
+        if gaps.latest is not None:
+            np.minimum(latest, gaps.latest, out=latest)
+        return Gaps(gaps.earliest, latest)
 
     def _path_back(self, commanded: State, states: Array) -> Window:
         """Return the hold law's path from a state to a reference."""
@@ -218,10 +266,12 @@ class Tracker:
 
     def _limited(self, commanded: State, jerk: Array) -> Array:
         """Return jerks (N, 2) that keep the limits exactly, if the state allows this."""
-        max_jerk = self.program.jerk_limits
-        clipped = np.clip(jerk, -max_jerk, max_jerk)
-        if self._excess(commanded, clipped) <= _LIMIT_TOLERANCE:
-            return clipped
+        values = self._values
+        jerks = values[:, : self._n]
+        np.maximum(jerk.T, -self._max_jerk, out=jerks)
+        np.minimum(jerks, self._max_jerk, out=jerks)
+        if self._excess(commanded, values) <= _LIMIT_TOLERANCE:
+            return jerks.T.copy()
         now = commanded
         for k, (along, across) in enumerate(jerk.tolist()):
             allowed = limited_jerk(now, (along, across), self._limits, self._tick_s)
@@ -229,25 +279,46 @@ class Tracker:
             now = integrate(now, allowed, self._tick_s)
         return jerk
 
-    def _excess(self, commanded: State, jerk: Array) -> float:
-        """Return the maximum excess over a limit of the states that result from jerks (N, 2)."""
-        limits, h = self._limits, self._tick_s
-        rate = np.cumsum(jerk, axis=0)
-        rate *= h
-        rate += (commanded[2], commanded[5])
-        change = rate - jerk * (h / 2.0)
-        speed = np.cumsum(change, axis=0)
-        speed *= h
-        speed += (commanded[1], commanded[4])
-        v, a, a_y = speed[:, 0], rate[:, 0], rate[:, 1]
-        return max(
-            float(a.max()) - limits.max_accel_mps2,
-            limits.min_accel_mps2 - float(a.min()),
-            float(np.abs(a_y).max()) - limits.max_lateral_accel_mps2,
-            float(v.max()) - limits.max_speed_mps,
-            -float(v.min()),
-            float((np.abs(speed[:, 1]) - limits.max_slip_ratio * v).max()),
+    def _excess(self, commanded: State, values: Array) -> float:
+        """Return the maximum excess over a limit of the states that result from jerks.
+
+        Args:
+            commanded: commanded state now.
+            values: jerks along and across (2, N), and room for two more columns.
+        """
+        limits = self._limits
+        _, v, a, _, v_y, a_y = commanded
+        values[:, -2:] = (a, v), (a_y, v_y)
+        states = values.dot(self._rollout).reshape(2, 2, self._n)
+        (max_a, max_v), (max_ay, max_vy) = states.max(axis=2).tolist()
+        (min_a, min_v), (min_ay, min_vy) = states.min(axis=2).tolist()
+        excess: float = max(
+            max_a - limits.max_accel_mps2,
+            limits.min_accel_mps2 - min_a,
+            max(max_ay, -min_ay) - limits.max_lateral_accel_mps2,
+            max_v - limits.max_speed_mps,
+            -min_v,
         )
+        slip: float = max(max_vy, -min_vy) - limits.max_slip_ratio * min_v
+        if slip > excess:  # this bound is usually enough
+            slip = float((np.abs(states[1, 1]) - limits.max_slip_ratio * states[0, 1]).max())
+        return max(excess, slip)
+
+
+@cache
+def _rollout(n: int, tick_s: float) -> Array:
+    """Return the matrix (N + 2, 2 N) from jerks, acceleration and speed to later ones.
+
+    The first N columns give the accelerations at the next ticks, the others the speeds.
+    """
+    later = np.arange(1, n + 1)
+    ticks = np.maximum(later - np.arange(n)[:, None], 0)  # since the beginning of a jerk
+    matrix = np.zeros((n + 2, 2 * n))
+    matrix[:n, :n] = tick_s * (ticks > 0)
+    matrix[:n, n:] = tick_s * tick_s * np.maximum(ticks - 0.5, 0.0)
+    matrix[n, :n] = matrix[n + 1, n:] = 1.0
+    matrix[n, n:] = tick_s * later
+    return matrix
 
 
 def _error(commanded: State, target: Window) -> State:

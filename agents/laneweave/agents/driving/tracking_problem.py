@@ -17,6 +17,7 @@ one takes four times as long. All matrices are set up once; each tick changes on
 
 from __future__ import annotations
 
+import threading
 from functools import cache
 from typing import Any
 
@@ -34,7 +35,6 @@ from laneweave.agents.driving.regulator import (
     cost_to_go,
     shared_regulator,
 )
-from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.vehicle_tables import Vehicle
 from laneweave.protocol.vehicle.motion import State, integrate
 
@@ -66,15 +66,18 @@ _SLIP_TOLERANCE_MPS = 0.1
 
 @frozen(eq=False)
 class Gaps:
-    """Bounds on the front bumper set by other vehicles, now and at the next N ticks [m].
+    """Bounds set by other vehicles, now and at the next N ticks [m].
 
-    Commanded positions (N + 1,), infinite at ticks without a bound.
+    Commanded positions (N + 1,), infinite at ticks without a bound; of the front bumper unless
+    noted.
     """
 
     earliest: Array | None = None
     """Lower bounds set by vehicles behind; None: there are none."""
     latest: Array | None = None
     """Upper bounds set by vehicles ahead; None: there are none."""
+    stopping: Array | None = None
+    """Upper bounds of the stopping points (`StoppingPoints`); None: there are none."""
 
     def check(self, ticks: int) -> None:
         """Check the shapes for a horizon of N ticks.
@@ -83,7 +86,8 @@ class Gaps:
             ValueError: a shape is not (N + 1,).
         """
         shape = (ticks + 1,)
-        for name, positions in (("earliest", self.earliest), ("latest", self.latest)):
+        for name in ("earliest", "latest", "stopping"):
+            positions = getattr(self, name)
             if positions is not None and positions.shape != shape:
                 raise ValueError(f"{name} has shape {positions.shape}, expected {shape}")
 
@@ -155,37 +159,49 @@ class ConstraintBounds:
 
 
 class TrackingProgram:
-    """The quadratic program of one vehicle; its bounds change at each tick."""
+    """The quadratic program of all vehicles with the same limits; each tick writes its bounds.
 
-    def __init__(self, scenario: Scenario, limits: Vehicle) -> None:
+    A solve does not depend on earlier ones, so vehicles can share a program, and OSQP's memory
+    stays in the processor's caches.
+    """
+
+    def __init__(self, n: int, tick_s: float, limits: Vehicle, settings: QPSettings) -> None:
         """Prepare the bounds; OSQP is set up on first use.
 
         Args:
-            scenario: tick, horizon.
-            limits: those of the vehicle.
+            n: horizon [ticks].
+            tick_s: length of a tick.
+            limits: those of the vehicles.
+            settings: OSQP settings.
         """
-        n = self._n = scenario.timing.horizon_ticks
-        self._tick_s = scenario.runtime.tick_s
-        self._limits = limits
-        self.jerk_limits = np.array(
-            [self._limits.max_jerk_mps3, self._limits.max_lateral_jerk_mps3]
-        )
-        self.cost = _cost(n, self._tick_s)
+        self._n, self._tick_s, self._limits, self._settings = n, tick_s, limits, settings
+        self._max_jerk = np.array([limits.max_jerk_mps3, limits.max_lateral_jerk_mps3])
+        self.cost = _cost(n, tick_s)
         """P, sparse, over x = (e_1 .. e_N, w_0 .. w_N-1, g_1 .. g_N)."""
-        self.constraints = _constraints(n, self._tick_s, self._limits.max_slip_ratio)
+        self.constraints = _constraints(n, tick_s, limits.max_slip_ratio)
         """A, sparse; the first 6 N constraints are the dynamics."""
         self.low, self.high = _initial_bounds(n)
         self._gaps = NO_GAPS
+        self._holds = False
+        """Whether the bounds are those of a vehicle that holds a cell, with no other vehicle."""
+        self._only_error = False
+        """Whether only e_0 has changed since the last solve."""
         self._qp: QuadraticProgram | None = None
-        self._regulator = shared_regulator(n, self._tick_s, limits.max_slip_ratio)
+        regulator, scale = shared_regulator(n, tick_s, limits.max_slip_ratio), program_scale(n)
+        solution = np.concatenate([regulator.errors, regulator.inputs])
+        self._solution = solution / scale.unknowns[: 8 * n, None]
+        self._gradients = regulator.multipliers / scale.constraints[: 6 * n, None]
         self._start, self._multipliers = np.zeros(9 * n), np.zeros(14 * n)
         """Where OSQP starts; slacks and the multipliers of inequalities stay zero."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Return how to restore the program: copies share it, too."""
+        return shared_program, (self._n, self._tick_s, self._limits)
 
     def solve(self, error: State) -> QPResult:
         """Solve with the most recently written bounds, starting from the regulator's solution.
 
-        If no inequality binds, this is the solution, and OSQP ends after one iteration. Nothing of
-        earlier solves matters.
+        If no inequality binds, this is the solution, and OSQP ends after one iteration.
 
         Args:
             error: e_0, as in `write_bounds`.
@@ -193,29 +209,25 @@ class TrackingProgram:
         qp = self._qp
         if qp is None:
             qp = self.set_up()
-        qp.update(self.low.all, self.high.all)
-        n, regulator = self._n, self._regulator
-        regulator.errors.dot(error, out=self._start[: 6 * n])
-        regulator.inputs.dot(error, out=self._start[6 * n : 8 * n])
-        regulator.multipliers.dot(error, out=self._multipliers[: 6 * n])
+        if self._only_error:
+            qp.replace_equalities(slice(6), self.low.dynamics[0])
+        else:
+            qp.update(self.low.all, self.high.all)
+        n = self._n
+        self._solution.dot(error, out=self._start[: 8 * n])
+        self._gradients.dot(error, out=self._multipliers[: 6 * n])
         return qp.solve_from(self._start, self._multipliers)
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Return the state without OSQP's, which is set up again on first use.
-
-        Views of arrays must stay views (`ConstraintBounds`), as with `laneweave.env.copies`.
-        """
-        return self.__dict__ | {"_qp": None}
 
     def set_up(self) -> QuadraticProgram:
         """Set up OSQP with initial bounds; results then do not depend on the time of the set-up."""
         low, high = _initial_bounds(self._n)
+        self._holds = False
         self._qp = QuadraticProgram(
             self.cost,
             self.constraints,
             low.all,
             high.all,
-            settings=SETTINGS,
+            settings=self._settings,
             scale=program_scale(self._n),
         )
         return self._qp
@@ -225,7 +237,14 @@ class TrackingProgram:
         return result.x[6 * self._n : 8 * self._n].reshape(-1, 2)
 
     def write_bounds(
-        self, error: State, states: Array, jerks: Array, defect: Array | None, gaps: Gaps
+        self,
+        error: State,
+        states: Array,
+        jerks: Array,
+        defect: Array | None,
+        gaps: Gaps,
+        *,
+        holds: bool = False,
     ) -> None:
         """Write all bounds.
 
@@ -235,8 +254,17 @@ class TrackingProgram:
             jerks: jerks of the reference (N, 2).
             defect: c (N, 3) along the road; None: zero.
             gaps: bounds set by other vehicles.
+            holds: whether the reference holds a cell throughout.
         """
         low, high, limits = self.low, self.high, self._limits
+        held = self._holds and self._gaps is NO_GAPS
+        self._holds = holds and gaps is NO_GAPS
+        self._only_error = held and self._holds
+        if self._only_error:
+            first = low.dynamics[0]
+            np.negative(integrate(error, (0.0, 0.0), self._tick_s), out=first)
+            high.dynamics[0] = first
+            return
         low.dynamics[:] = 0.0
         if defect is not None:
             low.dynamics[:, :3] -= defect
@@ -256,8 +284,8 @@ class TrackingProgram:
         np.subtract(margin, slip, out=high.slip_left)
         np.add(margin, slip, out=low.slip_right)
         np.negative(low.slip_right, out=low.slip_right)
-        np.subtract(self.jerk_limits, jerks, out=high.jerk)
-        np.add(self.jerk_limits, jerks, out=low.jerk)
+        np.subtract(self._max_jerk, jerks, out=high.jerk)
+        np.add(self._max_jerk, jerks, out=low.jerk)
         np.negative(low.jerk, out=low.jerk)
 
     def write_gaps(self, states: Array, gaps: Gaps) -> None:
@@ -279,8 +307,29 @@ class TrackingProgram:
 
     def admit_zero(self) -> None:
         """Widen the bounds of the limits so that zero, the reference itself, is feasible."""
+        self._holds = self._only_error = False
         np.minimum(self.low.limits, 0.0, out=self.low.limits)
         np.maximum(self.high.limits, 0.0, out=self.high.limits)
+
+
+def shared_program(n: int, tick_s: float, limits: Vehicle) -> TrackingProgram:
+    """Return the program of all vehicles with these limits in this thread."""
+    key = n, tick_s, limits, SETTINGS
+    program = _THREAD.programs.get(key)
+    if program is None:
+        program = _THREAD.programs[key] = TrackingProgram(n, tick_s, limits, SETTINGS)
+    return program
+
+
+class _Thread(threading.local):
+    """Programs of one thread."""
+
+    def __init__(self) -> None:
+        """Begin without programs; called once in each thread."""
+        self.programs: dict[tuple[int, float, Vehicle, QPSettings], TrackingProgram] = {}
+
+
+_THREAD = _Thread()
 
 
 def program_scale(n: int) -> QPScale:

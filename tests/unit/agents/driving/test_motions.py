@@ -265,6 +265,21 @@ def test_a_sensed_vehicle_counts_whatever_its_motion() -> None:
     assert said[KNOWN] > sensed[KNOWN] + 0.5
 
 
+def test_a_vehicle_that_drives_as_announced_sets_no_bound_of_stopping_points() -> None:
+    """Plans leave room behind it; one that deviates may be braking."""
+    states = path(20)
+    seen = neighbour(states, 1, 20)
+    assert seen.speed_mps < SCENARIO.formation.speed_mps - 2.0
+    near = attrs.evolve(SCENARIO, braking=attrs.evolve(SCENARIO.braking, margin_m=9.0))
+    announced, unknown = (Surroundings(near, near.vehicle) for _ in range(2))
+    announced.on_motion(motion())
+    assert gaps(unknown, 20, (seen,)).stopping is not None
+    assert gaps(announced, 20, (seen,)).stopping is None
+    slower = neighbour(states, 1, 20, off_mps=-1.5)
+    assert gaps(announced, 20, (slower,)).stopping is not None
+    assert gaps(announced, 20, (seen, slower)).stopping is not None
+
+
 def test_a_motion_that_has_ended_or_was_not_repeated_does_not_count() -> None:
     for tick, repeats, counts in (
         (BEGIN + FRESH_TICKS, 0, True),

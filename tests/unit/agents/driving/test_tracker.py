@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import random
+import threading
 from collections.abc import Callable
 
 import numpy as np
@@ -14,7 +15,13 @@ from hypothesis import strategies as st
 
 from laneweave.agents.driving.reference import Reference, Window
 from laneweave.agents.driving.tracker import Tracker, TrackResult
-from laneweave.agents.driving.tracking_problem import Gaps
+from laneweave.agents.driving.tracking_problem import (
+    NO_GAPS,
+    SETTINGS,
+    Gaps,
+    TrackingProgram,
+    shared_program,
+)
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.motion import Jerk, State, cell_state, integrate, limited_jerk
@@ -353,3 +360,42 @@ def test_bad_shapes_raise() -> None:
     ):
         with pytest.raises(ValueError, match=name):
             Tracker(SCENARIO, LIMITS).solve(state, bad_window, bad_gaps)
+
+
+# --- the shared program ---------------------------------------------------------------------------
+
+
+def test_bounds_that_are_written_once_for_holding_vehicles_are_right() -> None:
+    """Whatever other vehicles did with the program before."""
+    held = Reference.hold(SCENARIO, LIMITS, (0, 1)).window(0)
+    moves = Reference.move(SCENARIO, LIMITS, (0, 1), (1, 1), 0).window(20)
+    assert held.holds
+    assert not moves.holds
+    behind = Gaps(latest=held.states[:, 0] + 0.3)
+    rng = np.random.default_rng(3)
+    shared = shared_program(N, TICK_S, LIMITS)
+    iterations = set()
+    for _ in range(60):
+        error = tuple(rng.normal(0.0, rng.choice([0.2, 1.0]), 6).tolist())
+        window, gaps = (held, moves)[rng.random() < 0.25], (NO_GAPS, behind)[rng.random() < 0.25]
+        if rng.random() < 0.25:
+            shared.write_gaps(window.states, behind)
+        new = TrackingProgram(N, TICK_S, LIMITS, SETTINGS)
+        new.write_bounds(error, window.states, window.jerks, None, gaps)
+        shared.write_bounds(error, window.states, window.jerks, None, gaps, holds=window.holds)
+        if rng.random() < 0.2:
+            new.admit_zero()
+            shared.admit_zero()
+        expected, got = new.solve(error), shared.solve(error)
+        assert got.x.tobytes() == expected.x.tobytes()
+        iterations.add(got.iterations)
+    assert min(iterations) == 1 < max(iterations)
+
+
+def test_threads_have_programs_of_their_own() -> None:
+    tracker, found = Tracker(SCENARIO, LIMITS), []
+    thread = threading.Thread(target=lambda: found.append(tracker.program))
+    thread.start()
+    thread.join()
+    assert found[0] is not tracker.program
+    assert Tracker(SCENARIO, LIMITS).program is tracker.program
