@@ -19,7 +19,7 @@ from rich import box
 from rich.table import Table
 
 from laneweave.agents.driving.reference import Reference, Window
-from laneweave.agents.driving.surroundings import SENSED_S
+from laneweave.agents.driving.stopping_points import SENSED_S
 from laneweave.agents.driving.tracker import Tracker, TrackResult
 from laneweave.agents.driving.tracking_problem import NO_GAPS, Gaps
 from laneweave.protocol.scenario.fields import Scenario

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from laneweave.agents.core import AgentCore
 from laneweave.agents.driving.motions import FRESH_TICKS, REPEAT_TICKS, Motions
 from laneweave.agents.driving.reference import Reference
-from laneweave.agents.driving.surroundings import SENSED_S, Surroundings
+from laneweave.agents.driving.stopping_points import SENSED_S
+from laneweave.agents.driving.surroundings import Surroundings
 from laneweave.agents.driving.tracking_problem import Gaps
 from laneweave.agents.host import AgentHost
 from laneweave.launch.fault_search.road.stand_ins import LightDriver

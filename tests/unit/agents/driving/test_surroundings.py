@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from laneweave.agents.driving.surroundings import SENSED_S, SLOW_S, SLOW_SHARE, Surroundings
+from laneweave.agents.driving.stopping_points import SENSED_S
+from laneweave.agents.driving.surroundings import SLOW_S, SLOW_SHARE, Surroundings
 from laneweave.agents.driving.tracking_problem import NO_GAPS, Gaps
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario.fields import Scenario
