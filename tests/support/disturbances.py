@@ -171,9 +171,10 @@ class Response:
 
     @property
     def back_s(self) -> float:
-        """Time from which all bodies are within reach of the reference, and stay there."""
-        away = (np.abs(self.position_m) > ARRIVED_ALONG_M).any(axis=1)
-        return float(self.times_s[np.flatnonzero(away)[-1]]) if away.any() else 0.0
+        """Time from which all bodies stay within reach of their references; infinite: none."""
+        away = np.flatnonzero((np.abs(self.position_m) > ARRIVED_ALONG_M).any(axis=1))
+        times_s = [*self.times_s.tolist(), np.inf]
+        return times_s[away[-1] + 1] if away.size else 0.0
 
 
 @define

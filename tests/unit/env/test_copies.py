@@ -19,8 +19,8 @@ from numpy.random import default_rng
 
 from laneweave.agents.driving.tracking_problem import (
     NO_GAPS,
-    SETTINGS,
     ConstraintBounds,
+    ProgramKind,
     TrackingProgram,
     shared_program,
 )
@@ -91,7 +91,8 @@ def test_a_copy_in_an_episode_continues_exactly_as_the_original(make: Copy, step
 def test_copies_share_the_program_and_solves_do_not_depend_on_earlier_ones() -> None:
     scenario = Scenario()
     n, tick_s = scenario.timing.horizon_ticks, scenario.runtime.tick_s
-    program = shared_program(n, tick_s, scenario.vehicle)
+    kind = ProgramKind(n, tick_s, scenario.formation.speed_mps, scenario.vehicle)
+    program = shared_program(kind)
     assert loaded(dumped(program)) is program
     states, jerks = np.zeros((n + 1, 6)), np.zeros((n, 2))
     states[:, 1] = 15.0
@@ -99,7 +100,7 @@ def test_copies_share_the_program_and_solves_do_not_depend_on_earlier_ones() -> 
     iterations = set()
     for spread in (0.3, 3.0) * 6:
         error = tuple(rng.normal(0.0, spread, 6).tolist())
-        new = TrackingProgram(n, tick_s, scenario.vehicle, SETTINGS)
+        new = TrackingProgram(kind)
         for one in (program, new):
             one.write_bounds(error, states, jerks, None, NO_GAPS)
         expected, got = new.solve(error), program.solve(error)

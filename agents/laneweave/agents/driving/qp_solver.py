@@ -140,9 +140,10 @@ class QuadraticProgram:
         triangle.eliminate_zeros()
         triangle.sort_indices()
         constraints_csc.sort_indices()
-        self._all_iterations = _osqp_settings(self._settings)
-        one = evolve(self._settings, max_iter=1, check_termination=1)
-        self._one_iteration = _osqp_settings(one)
+        self._osqp_settings = _osqp_settings(self._settings)
+        self._one_iteration_settings = _osqp_settings(
+            evolve(self._settings, max_iter=1, check_termination=1)
+        )
         self._solver = ext_builtin.OSQPSolver(
             ext_builtin.CSC(triangle),
             self._zero_x,
@@ -151,7 +152,7 @@ class QuadraticProgram:
             self._upper,
             m,
             n,
-            self._all_iterations,
+            self._osqp_settings,
         )
 
     def update(self, lower: Vector, upper: Vector) -> None:
@@ -165,22 +166,23 @@ class QuadraticProgram:
         if self._solver.update_data_vec(q=None, l=self._lower, u=self._upper):
             raise ValueError("OSQP refused the vectors")
 
+    def replace_equalities(self, constraints: slice, values: Vector) -> None:
+        """Replace both bounds of some constraints by equal values, which must be finite."""
+        values = values * self._scale.constraints[constraints]
+        self._lower[constraints] = self._upper[constraints] = values
+        if self._solver.update_data_vec(q=None, l=self._lower, u=self._upper):
+            raise ValueError("OSQP refused the vectors")
+
     def solve(self) -> QPResult:
         """Solve, warm-started from the previous solution."""
         return self._result(self._run())
 
-    def replace_equalities(self, rows: slice, values: Vector) -> None:
-        """Replace both bounds of some constraints by equal values, which must be finite."""
-        values = values * self._scale.constraints[rows]
-        self._lower[rows] = self._upper[rows] = values
-        if self._solver.update_data_vec(q=None, l=self._lower, u=self._upper):
-            raise ValueError("OSQP refused the vectors")
-
     def solve_from(self, x: Vector, multipliers: Vector) -> QPResult:
         """Solve, starting from x (n,) and the multipliers (m,) of the constraints.
 
-        Nothing of earlier solves matters, unless rho is adaptive. At the optimum, one iteration is
-        enough, after which OSQP tests for termination; then as its settings say.
+        The result does not depend on earlier solves unless rho is adaptive. OSQP tests for
+        termination after the first iteration, which is enough at the optimum, and then after every
+        `check_termination`.
 
         Args:
             x: in the units of the scale, x / `QPScale.unknowns`.
@@ -188,9 +190,9 @@ class QuadraticProgram:
         """
         solver = self._solver
         solver.warm_start(x, multipliers)
-        solver.update_settings(self._one_iteration)
+        solver.update_settings(self._one_iteration_settings)
         iterations = self._run()
-        solver.update_settings(self._all_iterations)
+        solver.update_settings(self._osqp_settings)
         if int(solver.info.status_val) != SOLVED:
             iterations += self._run()
         return self._result(iterations)

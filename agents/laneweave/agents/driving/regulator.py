@@ -3,8 +3,8 @@
 Each axis of a vehicle is a triple integrator (position, speed, acceleration) with constant jerk
 during a tick. With the weights below, the jerks that minimise the cost over an infinite horizon are
 w_k = -K e_k, where K follows from the fixed point S of the Riccati recursion. The multipliers of
-the dynamics are the gradients of the cost to go, S e_k. `Regulator` holds all of this for a whole
-horizon as matrices times e_0, with the values of all constraints.
+the dynamics are the gradients of the cost to go: S e_k for the step to e_k. `Regulator` holds all
+of this for a whole horizon as matrices times e_0, with the values of all constraints.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ class Regulator:
         transition, effect = axis_matrices(tick_s)
         inputs = np.zeros((ticks, 2, 6))
         errors = np.zeros((ticks, 6, 6))
-        last = np.zeros((6, 6))
+        costs_to_go = np.zeros((6, 6))
         for axis, weights in enumerate((WEIGHTS, LATERAL_WEIGHTS)):
             to_go = cost_to_go(weights, tick_s)
             gain = _gain(to_go, tick_s)
@@ -80,7 +80,7 @@ class Regulator:
                 inputs[k, axis, block] = (-gain @ error)[0]
                 error = (transition - effect @ gain) @ error
                 errors[k, block, block] = error
-            last[block, block] = to_go
+            costs_to_go[block, block] = to_go
         self.constraints: Array = np.concatenate(
             [
                 errors[:, 1],
@@ -98,7 +98,7 @@ class Regulator:
         """Matrix (2 N, 6) from e_0 to the jerks."""
         self.errors = errors.reshape(6 * ticks, 6)
         """Matrix (6 N, 6) from e_0 to e_1 .. e_N."""
-        self.multipliers = (last @ errors).reshape(6 * ticks, 6)
+        self.multipliers = (costs_to_go @ errors).reshape(6 * ticks, 6)
         """Matrix (6 N, 6) from e_0 to the multipliers of the dynamics."""
         self._ticks = ticks
 

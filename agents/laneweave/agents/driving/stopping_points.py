@@ -1,17 +1,19 @@
 """Stopping points: where vehicles would stand if all braked as hard as they can from now on.
 
 The emergency brake acts when a vehicle's stopping point passes that of the vehicle ahead
-(`protocol.vehicle.emergency_brake`). The tracker keeps its predicted stopping points `_EARLY_M`
-behind, so that a vehicle brakes early and little instead of late and hard, and a disturbance
-becomes smaller from vehicle to vehicle. The acceleration of a vehicle ahead is assumed to fade
-within about `SENSED_S`.
+(`protocol.vehicle.emergency_brake`). The tracker's reference yields so that the predicted stopping
+points stay `_EARLY_M` behind: a vehicle brakes early and little instead of late and hard, and a
+disturbance becomes smaller from vehicle to vehicle. The acceleration of a vehicle ahead is assumed
+to fade within about `SENSED_S`.
 
 All positions of the vehicle itself are commanded ones (`protocol.vehicle.motion`).
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +30,7 @@ from laneweave.protocol.vehicle.motion import SETTLED_MPS, State
 from laneweave.protocol.wire.messages import Neighbour
 
 Array = NDArray[np.float64]
+Number = TypeVar("Number", float, Array)
 
 SENSED_S = 1.0
 """Time for which neighbours are predicted from what is sensed of them."""
@@ -37,7 +40,13 @@ _SLOWER_MPS = 2.0
 """Loss of speed of a vehicle ahead from which the whole distance is kept: plans leave less to a
 vehicle that holds its cell."""
 _REACT_S = 0.3
-"""Time allowed to restore it."""
+"""Time allowed to restore that distance."""
+_NEAR_M = 2.0
+"""Distance from a bound at which it is computed for all ticks."""
+_LEAST_M = 1e-3
+"""Shortest distance in which a vehicle is asked to stop."""
+_KEPT_LATER = math.exp(-1.0)
+"""Share of its acceleration that a vehicle ahead keeps after `SENSED_S`."""
 
 
 class StoppingPoints:
@@ -85,8 +94,8 @@ class StoppingPoints:
         for other in ahead:
             if self._is_far(commanded, s_m, other):
                 continue
-            limits = self._limits(s_m, other)
-            positions = limits if positions is None else np.minimum(positions, limits)
+            own = self._bounds_behind(s_m, other)
+            positions = own if positions is None else np.minimum(positions, own)
         if positions is None:
             return None
         bounds = np.full(self._size, np.inf)
@@ -94,10 +103,11 @@ class StoppingPoints:
         return bounds
 
     def needed_decel_mps2(self, commanded: State, bounds: Array) -> float:
-        """Return the gentlest constant deceleration that keeps the bounds; negative: none.
+        """Return the gentlest constant deceleration that keeps the bounds.
 
         A vehicle that brakes with d from speed v has the speed w = v - d t at time t, and stops
-        at s + (v + w) t / 2 + w^2 / (2 b), with the reaction time included in t.
+        at s + (v + w) t / 2 + w^2 / (2 b), with the reaction time included in t. If it stands
+        before, it has stopped at s + v^2 / (2 d). Negative: it may accelerate.
 
         Args:
             commanded: commanded state of the vehicle.
@@ -107,41 +117,39 @@ class StoppingPoints:
         first, known = self._first, self._known
         t = self._times_s[first:] + self._reaction_s
         half = 0.5 * t
-        room = half * half - (2.0 / brake) * (s + v * half - bounds[first:known])
+        free_m = bounds[first:known] - s
+        room = half * half + (2.0 / brake) * (free_m - v * half)
         w = brake * (np.sqrt(np.maximum(room, 0.0)) - half)
-        return float(((v - w) / t).max())
+        standing = v * v / (2.0 * np.maximum(free_m, _LEAST_M))
+        return float(np.where(w >= 0.0, (v - w) / t, standing).max())
 
     def _is_far(self, commanded: State, s_m: float, other: Neighbour) -> bool:
         """Return whether a vehicle ahead sets no bound that matters, now and after `SENSED_S`."""
-        accel = other.accel_mps2
-        gained_mps = accel * SENSED_S * (1.0 - _KEPT)
-        later_mps = other.speed_mps + gained_mps
-        if min(other.speed_mps, later_mps) > self._lattice_mps - SETTLED_MPS:
+        later = _predicted(other, SENSED_S, _KEPT_LATER)
+        if min(other.speed_mps, later[1]) > self._lattice_mps - SETTLED_MPS:
             return True  # plans leave room behind vehicles that hold their cells
-        moved_m = max((other.speed_mps + accel * SENSED_S - gained_mps) * SENSED_S, 0.0)
-        brake, lag_s, reaction_s = self._lead_brake_mps2, self._lead_lag_s, self._reaction_s
         s, v, a, _, _, _ = commanded
-        for after_s, speed_mps, accel_mps2, ahead_m in (
-            (0.0, other.speed_mps, accel, 0.0),
-            (SENSED_S, later_mps, accel * _KEPT, moved_m),
+        for after_s, (moved_m, speed_mps, accel_mps2) in (
+            (0.0, (0.0, other.speed_mps, other.accel_mps2)),
+            (SENSED_S, later),
         ):
-            t_s = after_s + reaction_s
+            t_s = after_s + self._reaction_s
             own_mps = v + max(a, 0.0) * t_s
             own_m = s + own_mps * t_s + own_mps * own_mps / (2.0 * self._brake_mps2)
-            path_m = lead_path_m(speed_mps, accel_mps2, brake, lag_s)
-            if own_m > s_m + other.gap_m + ahead_m + path_m - self._apart_m - _NEAR_M:
+            path_m = lead_path_m(speed_mps, accel_mps2, self._lead_brake_mps2, self._lead_lag_s)
+            stop_m = s_m + other.gap_m + max(moved_m, 0.0) + path_m
+            if own_m > stop_m - self._apart_m - _NEAR_M:
                 return False
         return True
 
-    def _limits(self, s_m: float, other: Neighbour) -> Array:
+    def _bounds_behind(self, s_m: float, other: Neighbour) -> Array:
         """Return the bounds (known ticks,) set by one vehicle ahead."""
-        accel, brake, lag_s = other.accel_mps2, self._lead_brake_mps2, self._lead_lag_s
-        gained = accel * SENSED_S * (1.0 - self._kept)
-        speeds = np.maximum(other.speed_mps + gained, 0.0)
-        moved = (other.speed_mps + accel * SENSED_S) * self._times_s - gained * SENSED_S
+        brake, lag_s = self._lead_brake_mps2, self._lead_lag_s
+        moved, speeds, accels = _predicted(other, self._times_s, self._kept)
         positions = np.maximum.accumulate(moved)
+        speeds = np.maximum(speeds, 0.0)
         # As `lead_path_m`, for all ticks at once.
-        change = np.clip(accel * self._kept, -brake, 0.0) + brake
+        change = np.clip(accels, -brake, 0.0) + brake
         braking = speeds + lag_s * change
         paths = braking * braking / (2.0 * brake) - lag_s * lag_s * change
         positions += np.maximum(paths, speeds * speeds / (2.0 * brake))
@@ -151,7 +159,14 @@ class StoppingPoints:
         return positions
 
 
-_KEPT = float(np.exp(-1.0))
-"""Share of its acceleration that a vehicle ahead keeps after `SENSED_S`."""
-_NEAR_M = 2.0
-"""Distance from a bound at which it is computed for all ticks."""
+def _predicted(other: Neighbour, t_s: Number, kept: Number) -> tuple[Number, Number, Number]:
+    """Return distance, speed and acceleration of a vehicle ahead after a time, without standing.
+
+    Args:
+        other: the vehicle as it is sensed now.
+        t_s: time, or times (n,).
+        kept: share of its acceleration that it keeps then.
+    """
+    gained = other.accel_mps2 * SENSED_S * (1.0 - kept)
+    moved = (other.speed_mps + other.accel_mps2 * SENSED_S) * t_s - gained * SENSED_S
+    return moved, other.speed_mps + gained, other.accel_mps2 * kept

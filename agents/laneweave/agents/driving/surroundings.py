@@ -1,10 +1,10 @@
 """Surroundings: free positions between the sensed vehicles ahead and behind.
 
-Neighbours in the lanes that the body touches or enters are relevant. They are assumed to keep their
-speed for `SENSED_S`. A neighbour that matches an announced motion (`motions`) is also assumed to
-follow the motion's trajectory from the sensed position on. At each tick the nearer prediction
-counts, so an announcement cannot relax the limits of positions from sensors. A vehicle ahead that
-matches none also bounds the stopping points (`stopping_points`).
+Neighbours in the lanes that the body touches or enters are relevant. Bounds of positions assume
+that they keep their speed for `SENSED_S`. A neighbour that matches an announced motion (`motions`)
+is also assumed to follow the motion's trajectory from the sensed position on. At each tick the
+nearer prediction counts, so an announcement cannot relax the limits of positions from sensors. A
+vehicle ahead that matches none also bounds the stopping points (`stopping_points`).
 
 All positions are commanded ones (`protocol.vehicle.motion`): bodies of equal lag keep the distances
 between their commanded states.
@@ -30,8 +30,9 @@ from laneweave.protocol.wire.messages import Motion, Neighbour, Sense
 Array = NDArray[np.float64]
 
 SLOW_S = 2.0
-"""The same for slow neighbours ahead, so that this vehicle need not brake hard behind them. It is
-less than the time after which a vehicle that leaves the lane in time would reach them."""
+"""Time for which slow neighbours ahead are assumed to keep their speed, so that this vehicle need
+not brake hard behind them. It is less than the time after which a vehicle that leaves the lane in
+time would reach them."""
 SLOW_SHARE = 0.5
 """Fraction of v_F below which a neighbour is slow; no vehicle that moves between cells is."""
 

@@ -37,6 +37,7 @@ from laneweave.agents.driving.tracking_problem import (
     NO_GAPS,
     ErrorBounds,
     Gaps,
+    ProgramKind,
     TrackingProgram,
     shared_program,
 )
@@ -67,7 +68,8 @@ class TrackResult:
     solve_ms: float
     """CPU time of the calling thread [ms], including the set-up of OSQP at its first use."""
     violation: float
-    """Maximum violation of a constraint by the solver's solution, before `limited_jerk`."""
+    """Maximum violation of a constraint by the solver's solution, before `limited_jerk`, or an
+    upper bound of it."""
 
 
 class Tracker:
@@ -100,9 +102,8 @@ class Tracker:
         self._stopping_points = StoppingPoints(scenario, limits)
         self._max_jerk = np.array([[limits.max_jerk_mps3], [limits.max_lateral_jerk_mps3]])
         self._rollout, self._values = _rollout(n, self._tick_s), np.zeros((2, n + 2))
+        self._kind = ProgramKind(n, self._tick_s, scenario.formation.speed_mps, limits)
         self._program: TrackingProgram | None = None
-        self._thread = 0
-        """Thread of the program."""
         self._regulator = None
         self.unconstrained_errors: tuple[float, ...] = ()
         """Errors up to which no constraint binds while a cell is held."""
@@ -115,10 +116,9 @@ class Tracker:
     @property
     def program(self) -> TrackingProgram:
         """The program, shared by the trackers of this thread with the same limits."""
-        program, thread = self._program, get_ident()
-        if program is None or thread != self._thread:
-            program = self._program = shared_program(self._n, self._tick_s, self._limits)
-            self._thread = thread
+        program = self._program
+        if program is None or program.thread != get_ident():
+            program = self._program = shared_program(self._kind)
         return program
 
     def solve(self, commanded: State, window: Window, gaps: Gaps = NO_GAPS) -> TrackResult:
@@ -138,26 +138,24 @@ class Tracker:
             gaps.check(self._n)
         program = self.program
         target = self._yielding(commanded, window, gaps)
-        bounds = self._positions(gaps, target)
         iterations = 0
         error = _error(commanded, target)
         usable = _is_near(error)
         if usable:
-            jerk = self._regulated(error, target, bounds)
+            jerk = self._regulated(error, target, gaps)
             if jerk is not None:
                 elapsed_ms = (self._stopwatch() - start) * 1e3
                 return TrackResult(jerk, True, 0, elapsed_ms, 0.0)
             program.write_bounds(
-                error, target.states, target.jerks, target.defect, bounds, holds=target.holds
+                error, target.states, target.jerks, target.defect, gaps, holds=target.holds
             )
             result = program.solve(error)
             usable, iterations = result.usable, result.iterations
         if not usable:
             back = self._path_back(commanded, window.states)
             target = self._yielding(commanded, back, gaps)
-            bounds = self._positions(gaps, target)
             error = _error(commanded, target)
-            program.write_bounds(error, target.states, target.jerks, target.defect, bounds)
+            program.write_bounds(error, target.states, target.jerks, target.defect, gaps)
             program.admit_zero()
             result = program.solve(error)
             usable, iterations = result.usable, iterations + result.iterations
@@ -242,18 +240,6 @@ class Tracker:
         if stopping is None:
             return False
         return bool((s + self._stopping_points.distances_m(states) > stopping).any())
-
-    def _positions(self, gaps: Gaps, target: Window) -> Gaps:
-        """Return the gaps with bounds of positions alone.
-
-        Those of stopping points apply at the speeds of the reference, which follow them.
-        """
-        if gaps.stopping is None:
-            return gaps
-        latest = gaps.stopping - self._stopping_points.distances_m(target.states)
-        if gaps.latest is not None:
-            np.minimum(latest, gaps.latest, out=latest)
-        return Gaps(gaps.earliest, latest)
 
     def _path_back(self, commanded: State, states: Array) -> Window:
         """Return the hold law's path from a state to a reference."""

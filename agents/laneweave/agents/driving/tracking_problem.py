@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import threading
 from functools import cache
+from threading import get_ident
 from typing import Any
 
 import numpy as np
@@ -55,6 +56,8 @@ _GAP_SCALE, _JERK_SCALE = 20.0, 0.4
 """Scales of gap and jerk constraints, 1 for others; at 1, active gaps take 300 iterations."""
 _STATE_SCALE = 0.3
 """Scale of states and slacks for OSQP; 1 for jerks, because their gradient must vanish."""
+_MAX_PROGRAMS = 32
+"""Maximum number of programs kept in a thread, of 0.7 MB each."""
 FAR_M = 1e4
 """Bound where there is no vehicle: finite, so that OSQP keeps the constraint's type."""
 _MAX_PUSH_M = 1.0
@@ -99,8 +102,8 @@ NO_GAPS = Gaps()
 class ErrorBounds:
     """Bounds, for n ticks, within which errors from a reference exceed no limit.
 
-    Unlike the program's bounds, they have no tolerance near standstill, so that the tracker's fast
-    path is exact.
+    Unlike the program's bounds, they have no tolerance near standstill, so that the tracker's
+    shortcut is exact.
     """
 
     low: Array
@@ -158,23 +161,31 @@ class ConstraintBounds:
         self.gap = self.all[13 * n :]
 
 
+@frozen
+class ProgramKind:
+    """What programs differ in."""
+
+    ticks: int
+    """Horizon N."""
+    tick_s: float
+    speed_mps: float
+    """v_F."""
+    limits: Vehicle
+    settings: QPSettings = SETTINGS
+
+
 class TrackingProgram:
     """The quadratic program of all vehicles with the same limits; each tick writes its bounds.
 
     A solve does not depend on earlier ones, so vehicles can share a program, and OSQP's memory
-    stays in the processor's caches.
+    stays in the processor's caches. A program belongs to one thread (`shared_program`).
     """
 
-    def __init__(self, n: int, tick_s: float, limits: Vehicle, settings: QPSettings) -> None:
-        """Prepare the bounds; OSQP is set up on first use.
-
-        Args:
-            n: horizon [ticks].
-            tick_s: length of a tick.
-            limits: those of the vehicles.
-            settings: OSQP settings.
-        """
-        self._n, self._tick_s, self._limits, self._settings = n, tick_s, limits, settings
+    def __init__(self, kind: ProgramKind) -> None:
+        """Prepare the bounds; OSQP is set up on first use."""
+        self._kind, self.thread = kind, get_ident()
+        n, tick_s, limits = kind.ticks, kind.tick_s, kind.limits
+        self._n, self._tick_s, self._limits = n, tick_s, limits
         self._max_jerk = np.array([limits.max_jerk_mps3, limits.max_lateral_jerk_mps3])
         self.cost = _cost(n, tick_s)
         """P, sparse, over x = (e_1 .. e_N, w_0 .. w_N-1, g_1 .. g_N)."""
@@ -184,8 +195,8 @@ class TrackingProgram:
         self._gaps = NO_GAPS
         self._holds = False
         """Whether the bounds are those of a vehicle that holds a cell, with no other vehicle."""
-        self._only_error = False
-        """Whether only e_0 has changed since the last solve."""
+        self._osqp_holds = False
+        """Whether OSQP has such bounds, for some e_0."""
         self._qp: QuadraticProgram | None = None
         regulator, scale = shared_regulator(n, tick_s, limits.max_slip_ratio), program_scale(n)
         solution = np.concatenate([regulator.errors, regulator.inputs])
@@ -196,7 +207,7 @@ class TrackingProgram:
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Return how to restore the program: copies share it, too."""
-        return shared_program, (self._n, self._tick_s, self._limits)
+        return shared_program, (self._kind,)
 
     def solve(self, error: State) -> QPResult:
         """Solve with the most recently written bounds, starting from the regulator's solution.
@@ -209,10 +220,12 @@ class TrackingProgram:
         qp = self._qp
         if qp is None:
             qp = self.set_up()
-        if self._only_error:
+        if self._holds and self._osqp_holds:
             qp.replace_equalities(slice(6), self.low.dynamics[0])
         else:
+            self._osqp_holds = False
             qp.update(self.low.all, self.high.all)
+            self._osqp_holds = self._holds
         n = self._n
         self._solution.dot(error, out=self._start[: 8 * n])
         self._gradients.dot(error, out=self._multipliers[: 6 * n])
@@ -221,13 +234,13 @@ class TrackingProgram:
     def set_up(self) -> QuadraticProgram:
         """Set up OSQP with initial bounds; results then do not depend on the time of the set-up."""
         low, high = _initial_bounds(self._n)
-        self._holds = False
+        self._osqp_holds = False
         self._qp = QuadraticProgram(
             self.cost,
             self.constraints,
             low.all,
             high.all,
-            settings=self._settings,
+            settings=self._kind.settings,
             scale=program_scale(self._n),
         )
         return self._qp
@@ -257,11 +270,11 @@ class TrackingProgram:
             holds: whether the reference holds a cell throughout.
         """
         low, high, limits = self.low, self.high, self._limits
-        held = self._holds and self._gaps is NO_GAPS
-        self._holds = holds and gaps is NO_GAPS
-        self._only_error = held and self._holds
-        if self._only_error:
-            first = low.dynamics[0]
+        first, holds = low.dynamics[0], holds and gaps is NO_GAPS
+        # False until all bounds are written.
+        held, self._holds = self._holds and self._gaps is NO_GAPS, False
+        if holds and held:
+            self._holds = True
             np.negative(integrate(error, (0.0, 0.0), self._tick_s), out=first)
             high.dynamics[0] = first
             return
@@ -287,6 +300,7 @@ class TrackingProgram:
         np.subtract(self._max_jerk, jerks, out=high.jerk)
         np.add(self._max_jerk, jerks, out=low.jerk)
         np.negative(low.jerk, out=low.jerk)
+        self._holds = holds
 
     def write_gaps(self, states: Array, gaps: Gaps) -> None:
         """Write the bounds of the gap constraints for a reference (N + 1, 6)."""
@@ -307,26 +321,28 @@ class TrackingProgram:
 
     def admit_zero(self) -> None:
         """Widen the bounds of the limits so that zero, the reference itself, is feasible."""
-        self._holds = self._only_error = False
+        self._holds = False
         np.minimum(self.low.limits, 0.0, out=self.low.limits)
         np.maximum(self.high.limits, 0.0, out=self.high.limits)
 
 
-def shared_program(n: int, tick_s: float, limits: Vehicle) -> TrackingProgram:
-    """Return the program of all vehicles with these limits in this thread."""
-    key = n, tick_s, limits, SETTINGS
-    program = _THREAD.programs.get(key)
+def shared_program(kind: ProgramKind) -> TrackingProgram:
+    """Return the program of a kind in this thread."""
+    programs = _THREAD.programs
+    program = programs.get(kind)
     if program is None:
-        program = _THREAD.programs[key] = TrackingProgram(n, tick_s, limits, SETTINGS)
+        if len(programs) >= _MAX_PROGRAMS:
+            del programs[next(iter(programs))]
+        program = programs[kind] = TrackingProgram(kind)
     return program
 
 
 class _Thread(threading.local):
-    """Programs of one thread."""
+    """Programs of one thread, oldest first."""
 
     def __init__(self) -> None:
         """Begin without programs; called once in each thread."""
-        self.programs: dict[tuple[int, float, Vehicle, QPSettings], TrackingProgram] = {}
+        self.programs: dict[ProgramKind, TrackingProgram] = {}
 
 
 _THREAD = _Thread()

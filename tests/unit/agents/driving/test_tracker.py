@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import math
+import pickle
 import random
 import threading
 from collections.abc import Callable
@@ -13,18 +15,22 @@ from attrs import evolve
 from hypothesis import given
 from hypothesis import strategies as st
 
+from laneweave.agents.driving.qp_solver import QuadraticProgram
 from laneweave.agents.driving.reference import Reference, Window
+from laneweave.agents.driving.stopping_points import StoppingPoints
 from laneweave.agents.driving.tracker import Tracker, TrackResult
 from laneweave.agents.driving.tracking_problem import (
     NO_GAPS,
     SETTINGS,
     Gaps,
+    ProgramKind,
     TrackingProgram,
     shared_program,
 )
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.motion import Jerk, State, cell_state, integrate, limited_jerk
+from laneweave.protocol.wire.messages import Neighbour
 from support.examples import examples
 from support.tables import for_each
 
@@ -332,8 +338,9 @@ def good_input() -> tuple[State, Window, Gaps]:
 def test_bad_numbers_raise_and_leave_nothing_behind(part: str, number: float) -> None:
     if part in ("earliest", "latest") and not math.isnan(number):
         return
-    used, fresh = Tracker(SCENARIO, LIMITS), Tracker(SCENARIO, LIMITS)
+    used = Tracker(SCENARIO, LIMITS)
     state, window, gaps = good_input()
+    expected = [used.solve(state, window, each).jerk for each in (gaps, NO_GAPS)]
     bad_state, bad_window, bad_gaps = good_input()
     if part == "state":
         bad_state = (*bad_state[:4], number, 0.0)
@@ -344,9 +351,10 @@ def test_bad_numbers_raise_and_leave_nothing_behind(part: str, number: float) ->
         getattr(bad_window, part)[11, 1] = number
     with pytest.raises(ValueError, match=r".+"):
         used.solve(bad_state, bad_window, bad_gaps)
-    after, expected = used.solve(state, window, gaps), fresh.solve(state, window, gaps)
-    assert after.usable
-    assert after.jerk.tobytes() == expected.jerk.tobytes()
+    for each, jerk in zip((gaps, NO_GAPS), expected, strict=True):
+        after = used.solve(state, window, each)
+        assert after.usable
+        assert after.jerk.tobytes() == jerk.tobytes()
 
 
 def test_bad_shapes_raise() -> None:
@@ -357,6 +365,7 @@ def test_bad_shapes_raise() -> None:
         ("window", Window(window.states, window.jerks[:-1]), Gaps()),
         ("latest", window, Gaps(latest=short)),
         ("earliest", window, Gaps(earliest=-short)),
+        ("stopping", window, Gaps(stopping=short)),
     ):
         with pytest.raises(ValueError, match=name):
             Tracker(SCENARIO, LIMITS).solve(state, bad_window, bad_gaps)
@@ -366,21 +375,22 @@ def test_bad_shapes_raise() -> None:
 
 
 def test_bounds_that_are_written_once_for_holding_vehicles_are_right() -> None:
-    """Whatever other vehicles did with the program before."""
+    """The bounds do not depend on earlier writes."""
     held = Reference.hold(SCENARIO, LIMITS, (0, 1)).window(0)
     moves = Reference.move(SCENARIO, LIMITS, (0, 1), (1, 1), 0).window(20)
     assert held.holds
     assert not moves.holds
     behind = Gaps(latest=held.states[:, 0] + 0.3)
     rng = np.random.default_rng(3)
-    shared = shared_program(N, TICK_S, LIMITS)
+    kind = ProgramKind(N, TICK_S, SCENARIO.formation.speed_mps, LIMITS)
+    shared = shared_program(kind)
     iterations = set()
     for _ in range(60):
         error = tuple(rng.normal(0.0, rng.choice([0.2, 1.0]), 6).tolist())
         window, gaps = (held, moves)[rng.random() < 0.25], (NO_GAPS, behind)[rng.random() < 0.25]
         if rng.random() < 0.25:
             shared.write_gaps(window.states, behind)
-        new = TrackingProgram(N, TICK_S, LIMITS, SETTINGS)
+        new = TrackingProgram(kind)
         new.write_bounds(error, window.states, window.jerks, None, gaps)
         shared.write_bounds(error, window.states, window.jerks, None, gaps, holds=window.holds)
         if rng.random() < 0.2:
@@ -393,9 +403,65 @@ def test_bounds_that_are_written_once_for_holding_vehicles_are_right() -> None:
 
 
 def test_threads_have_programs_of_their_own() -> None:
-    tracker, found = Tracker(SCENARIO, LIMITS), []
-    thread = threading.Thread(target=lambda: found.append(tracker.program))
+    tracker, found = Tracker(SCENARIO, LIMITS), list[TrackingProgram]()
+    own = tracker.program
+    copies = list[Tracker]()
+
+    def work() -> None:
+        copies.append(copy.deepcopy(tracker))
+        found.extend([tracker.program, copies[0].program])
+
+    thread = threading.Thread(target=work)
     thread.start()
     thread.join()
-    assert found[0] is not tracker.program
-    assert Tracker(SCENARIO, LIMITS).program is tracker.program
+    assert found[0] is found[1]
+    assert found[0] is not own
+    # Whichever thread has used or copied them before.
+    assert tracker.program is copies[0].program is Tracker(SCENARIO, LIMITS).program is own
+
+
+def test_programs_of_other_kinds_are_others() -> None:
+    own = Tracker(SCENARIO, LIMITS).program
+    faster = evolve(SCENARIO, formation=evolve(SCENARIO.formation, speed_mps=16.0))
+    stronger = evolve(LIMITS, max_accel_mps2=LIMITS.max_accel_mps2 + 1.0)
+    assert Tracker(faster, LIMITS).program is not own
+    assert Tracker(SCENARIO, stronger).program is not own
+    exact = ProgramKind(N, TICK_S, 15.0, LIMITS, evolve(SETTINGS, eps_abs=1e-7))
+    assert pickle.loads(pickle.dumps(shared_program(exact))) is shared_program(exact)  # noqa: S301
+
+
+def test_an_interrupted_solve_leaves_no_bounds_behind(monkeypatch: pytest.MonkeyPatch) -> None:
+    held = Reference.hold(SCENARIO, LIMITS, (0, 1)).window(0)
+    state = shifted(tuple(held.states[0].tolist()), -2.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    expected = Tracker(SCENARIO, LIMITS).solve(state, held)
+    pushed = Gaps(earliest=held.states[:, 0] + 0.9)
+    Tracker(SCENARIO, LIMITS).solve(state, held, pushed)
+
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(QuadraticProgram, "update", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            Tracker(SCENARIO, LIMITS).solve(state, held)
+    got = Tracker(SCENARIO, LIMITS).solve(state, held)
+    assert got.jerk.tobytes() == expected.jerk.tobytes()
+
+
+def test_the_reference_yields_to_bounds_of_stopping_points() -> None:
+    held = Reference.hold(SCENARIO, LIMITS, (0, 1)).window(0)
+    state: State = tuple(held.states[0].tolist())
+    points = StoppingPoints(SCENARIO, LIMITS)
+    ahead = Neighbour(1, 6.0, 11.0, -2.0)
+    bounds = points.bounds(state, state[0], [ahead])
+    result = Tracker(SCENARIO, LIMITS).solve(state, held, Gaps(stopping=bounds))
+    assert bounds is not None
+    assert result.usable
+    path = np.array([state, *(then for then, _ in predicted(state, result))])
+    later = round(0.9 / TICK_S)
+    behind = path[:, 0] + points.distances_m(path) - bounds
+    assert behind[0] > 0.5
+    assert (behind[later:] < 0.3).all()
+    # No harder than needed: a constant deceleration, reached with limited jerk.
+    needed = points.needed_decel_mps2(state, bounds)
+    assert -1.3 * needed - 1.0 < path[:, 2].min() < -0.5 * needed
