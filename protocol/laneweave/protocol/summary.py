@@ -172,9 +172,7 @@ class Tracking:
 
     solves: int = figure("ticks at which an agent tracked a reference")
     osqp_solves: int | None = optional("solves with OSQP")
-    unconstrained_steps: int | None = optional(
-        "solves whose unconstrained optimum met all constraints"
-    )
+    unconstrained_steps: int | None = optional("solves without OSQP (`tracking.shortcut`)")
     unusable: int = figure("solves without a usable solution")
     hold_law_ticks: int | None = optional(
         "ticks in which the hold law drove a body, without a command"

@@ -177,23 +177,25 @@ class QuadraticProgram:
         """Solve, warm-started from the previous solution."""
         return self._result(self._run())
 
-    def solve_from(self, x: Vector, multipliers: Vector) -> QPResult:
+    def solve_from(self, x: Vector, multipliers: Vector, *, optimal: bool = True) -> QPResult:
         """Solve, starting from x (n,) and the multipliers (m,) of the constraints.
 
         The result does not depend on earlier solves unless rho is adaptive. OSQP tests for
-        termination after the first iteration, which is enough at the optimum, and then after every
-        `check_termination`.
+        termination after every `check_termination` iterations.
 
         Args:
             x: in the units of the scale, x / `QPScale.unknowns`.
             multipliers: likewise, divided by `QPScale.constraints`.
+            optimal: whether this may be the optimum: OSQP then tests after one iteration, too.
         """
         solver = self._solver
         solver.warm_start(x, multipliers)
-        solver.update_settings(self._one_iteration_settings)
-        iterations = self._run()
-        solver.update_settings(self._osqp_settings)
-        if int(solver.info.status_val) != SOLVED:
+        iterations = 0
+        if optimal:
+            solver.update_settings(self._one_iteration_settings)
+            iterations = self._run()
+            solver.update_settings(self._osqp_settings)
+        if not optimal or int(solver.info.status_val) != SOLVED:
             iterations += self._run()
         return self._result(iterations)
 

@@ -229,7 +229,15 @@ class TrackingProgram:
         n = self._n
         self._solution.dot(error, out=self._start[: 8 * n])
         self._gradients.dot(error, out=self._multipliers[: 6 * n])
-        return qp.solve_from(self._start, self._multipliers)
+        return qp.solve_from(self._start, self._multipliers, optimal=self._keeps_gaps())
+
+    def _keeps_gaps(self) -> bool:
+        """Return whether the start keeps the bounds of gaps."""
+        if self._gaps is NO_GAPS:
+            return True
+        positions = self._start[: 6 * self._n : 6] * _STATE_SCALE
+        kept = (self.low.gap <= positions).all() and (positions <= self.high.gap).all()
+        return bool(kept)
 
     def set_up(self) -> QuadraticProgram:
         """Set up OSQP with initial bounds; results then do not depend on the time of the set-up."""

@@ -125,7 +125,7 @@ def _control_rows(summary: RunSummary) -> Iterator[Row]:
         ("ticks of emergency braking", tracking.emergency_ticks),
         ("ticks driven without an agent", tracking.hold_law_ticks),
         ("ticks tracked with OSQP", tracking.osqp_solves),
-        ("ticks tracked unconstrained", tracking.unconstrained_steps),
+        ("ticks tracked without OSQP", tracking.unconstrained_steps),
     )
     yield from _numbers(
         ("tracking CPU time, median", tracking.solve_ms.p50, " ms"),

@@ -74,7 +74,7 @@ class Report(Message, frozen=True):
     unusable: Int64 = 0
     """Number of solves without a usable solution."""
     osqp_solves: Int64 = 0
-    """Number of solves with OSQP; in the rest the unconstrained optimum met all constraints."""
+    """Number of solves with OSQP; the others used `tracking.shortcut`."""
     solve_ms: bytes = b""
     """CPU time of each solve [ms], little-endian float32."""
 

@@ -149,7 +149,7 @@ def printed(outcome: Outcome) -> str:
     ("found", "more", "row"),
     [
         (summary(), {}, ("processes", "9")),
-        (summary(), {}, ("ticks tracked unconstrained", "50,383")),
+        (summary(), {}, ("ticks tracked without OSQP", "50,383")),
         (summary(), {}, ("vehicles demanded", "5")),
         (summary(), {}, ("left in their preferred lane", "100.00 % of 5 vehicles")),
         (
