@@ -43,6 +43,7 @@ SEEDS = 5
 DISTURBED_MPS = 0.5
 """Speed error beyond which a vehicle counts as disturbed; undisturbed runs stay below 0.35."""
 SHOWN_S = 15.0
+"""Time axis of the drawn cases."""
 QUANTITIES = ("speed_mps", "gap_m", "accel_mps2")
 SHOWN = (
     Case("column", 4.0),

@@ -44,7 +44,7 @@ Array = NDArray[np.float64]
 FORMATIONS = ("column", "switching", "rolling")
 BRAKING_S = 2.0
 MEASURED_S = {"column": 30.0, "switching": 15.0, "rolling": 20.0}
-"""Time measured from the beginning of the disturbance."""
+"""How long each formation is measured, from the beginning of the disturbance on."""
 HOLDING_S = 5.0
 """The column holds for this long before the disturbance."""
 ROLLING_VEH_PER_LANE_H = 2000.0

@@ -106,6 +106,7 @@ class TrackingDriver:
         self._own, self._limits = (scenario, limits), limits
         self._room_ahead_m = scenario.types.room_ahead_m
         self._tracker = Tracker(scenario, limits, stopwatch)
+        self._shortcut = scenario.tracking.shortcut
         self._reference: Reference | None = None
         self._settling: Reference | None = None
         """The reference with which the vehicle settles in the cell in which it has entered."""
@@ -169,7 +170,7 @@ class TrackingDriver:
             window = reference.window(tick)
             gaps = self._stop_lines.limit(gaps, window.states, sense.measured[0])
         result = None
-        if gaps is NO_GAPS and tick >= reference.end_tick:
+        if self._shortcut and gaps is NO_GAPS and tick >= reference.end_tick:
             goal = cell_state(self._lattice, self._goal, sense.t_s)
             result = self._tracker.rest(commanded, goal)
         if result is None:

@@ -163,13 +163,15 @@ class QuadraticProgram:
                 is -inf, or lower > upper. The program is then unchanged.
         """
         self._check_bounds(lower, upper)
-        if self._solver.update_data_vec(q=None, l=self._lower, u=self._upper):
-            raise ValueError("OSQP refused the vectors")
+        self._pass_bounds()
 
     def replace_equalities(self, constraints: slice, values: Vector) -> None:
         """Replace both bounds of some constraints by equal values, which must be finite."""
         values = values * self._scale.constraints[constraints]
         self._lower[constraints] = self._upper[constraints] = values
+        self._pass_bounds()
+
+    def _pass_bounds(self) -> None:
         if self._solver.update_data_vec(q=None, l=self._lower, u=self._upper):
             raise ValueError("OSQP refused the vectors")
 

@@ -33,16 +33,16 @@ Array = NDArray[np.float64]
 Number = TypeVar("Number", float, Array)
 
 SENSED_S = 1.0
-"""Time for which neighbours are predicted from what is sensed of them."""
+"""Time for which sensed neighbours are predicted."""
 _EARLY_M = 1.0
 """Distance that predicted stopping points keep from where the emergency brake acts."""
 _SLOWER_MPS = 2.0
-"""Loss of speed of a vehicle ahead from which the whole distance is kept: plans leave less to a
-vehicle that holds its cell."""
+"""Loss of speed of a vehicle ahead from which the whole distance is kept; less is kept for smaller
+losses, because plans leave less room behind vehicles that hold their cells."""
 _REACT_S = 0.3
 """Time allowed to restore that distance."""
 _NEAR_M = 2.0
-"""Distance from a bound at which it is computed for all ticks."""
+"""Distance to its bound from which a vehicle ahead is ignored."""
 _LEAST_M = 1e-3
 """Shortest distance in which a vehicle is asked to stop."""
 _KEPT_LATER = math.exp(-1.0)
@@ -143,7 +143,7 @@ class StoppingPoints:
         return True
 
     def _bounds_behind(self, s_m: float, other: Neighbour) -> Array:
-        """Return the bounds (known ticks,) set by one vehicle ahead."""
+        """Return the bounds (K,) set by one vehicle ahead, at the K ticks that are predicted."""
         brake, lag_s = self._lead_brake_mps2, self._lead_lag_s
         moved, speeds, accels = _predicted(other, self._times_s, self._kept)
         positions = np.maximum.accumulate(moved)

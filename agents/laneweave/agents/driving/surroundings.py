@@ -103,7 +103,7 @@ class Surroundings:
             lanes = min(first, lane), max(last, lane)
             if ahead:
                 latest, found = self._with_motions(latest, sensed_ahead, _AHEAD, lanes)
-                # Plans leave room behind motions that are driven as announced.
+                # Plans leave room behind vehicles that drive as announced.
                 ahead = [other for other, known in zip(ahead, found, strict=True) if not known]
             if behind:
                 earliest, _ = self._with_motions(earliest, sensed_behind, _BEHIND, lanes)

@@ -216,7 +216,7 @@ class Tracker:
             program = self.program
             program.write_gaps(target.states, gaps)
             free_gap = values[7 * n :]
-            if not ((program.low.gap <= free_gap).all() and (free_gap <= program.high.gap).all()):
+            if not program.keeps_gaps(free_gap):
                 return None
         answer: Array = target.jerks + free_jerk
         return answer

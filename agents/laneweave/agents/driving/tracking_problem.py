@@ -19,7 +19,6 @@ from __future__ import annotations
 
 import threading
 from functools import cache
-from threading import get_ident
 from typing import Any
 
 import numpy as np
@@ -163,7 +162,7 @@ class ConstraintBounds:
 
 @frozen
 class ProgramKind:
-    """What programs differ in."""
+    """Parameters that distinguish programs."""
 
     ticks: int
     """Horizon N."""
@@ -183,7 +182,7 @@ class TrackingProgram:
 
     def __init__(self, kind: ProgramKind) -> None:
         """Prepare the bounds; OSQP is set up on first use."""
-        self._kind, self.thread = kind, get_ident()
+        self._kind, self.thread = kind, threading.get_ident()
         n, tick_s, limits = kind.ticks, kind.tick_s, kind.limits
         self._n, self._tick_s, self._limits = n, tick_s, limits
         self._max_jerk = np.array([limits.max_jerk_mps3, limits.max_lateral_jerk_mps3])
@@ -229,15 +228,13 @@ class TrackingProgram:
         n = self._n
         self._solution.dot(error, out=self._start[: 8 * n])
         self._gradients.dot(error, out=self._multipliers[: 6 * n])
-        return qp.solve_from(self._start, self._multipliers, optimal=self._keeps_gaps())
+        optimal = self._gaps is NO_GAPS or self.keeps_gaps(self._start[: 6 * n : 6] * _STATE_SCALE)
+        return qp.solve_from(self._start, self._multipliers, optimal=optimal)
 
-    def _keeps_gaps(self) -> bool:
-        """Return whether the start keeps the bounds of gaps."""
-        if self._gaps is NO_GAPS:
-            return True
-        positions = self._start[: 6 * self._n : 6] * _STATE_SCALE
-        kept = (self.low.gap <= positions).all() and (positions <= self.high.gap).all()
-        return bool(kept)
+    def keeps_gaps(self, positions: Array) -> bool:
+        """Return whether position errors (N,) are within the gap bounds written last."""
+        low, high = self.low.gap, self.high.gap
+        return bool((low <= positions).all() and (positions <= high).all())
 
     def set_up(self) -> QuadraticProgram:
         """Set up OSQP with initial bounds; results then do not depend on the time of the set-up."""

@@ -101,9 +101,9 @@ class Facts:
     rolling: bool = False
     """Whether the run plans in slots."""
     unanswered: bool = False
-    """Whether it had not answered its last ballot when a plan did not lead it to its lane."""
+    """Whether its last ballot lacked its answer when a plan did not lead it to its lane."""
     silent_until_s: float = -math.inf
-    """When the last ballot was aborted that it had not answered."""
+    """Time at which the last ballot without its answer was aborted."""
     slot_planned_s: float = -math.inf
     """Time of the newest plan of a slot."""
     late_slots: int = 0

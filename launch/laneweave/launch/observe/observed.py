@@ -123,7 +123,7 @@ class Observed:
         """Position at which a vehicle of the rolling operation has been able to move for 20 s [m].
 
         From the settings of the bridge. None: they are unknown, formations are planned, or the road
-        has exits: whoever prefers an exit's lane waits until it opens.
+        has exits: vehicles that prefer an exit's lane wait until it opens.
         """
         settings = self.view.processes.settings.get((BRIDGE, BRIDGE, self.view.bridge))
         if settings is None:

@@ -45,7 +45,7 @@ def test_equal_seeds_give_equal_switches() -> None:
 
 
 def test_osqp_in_every_tick_drives_the_same_trajectories() -> None:
-    """`tracking.shortcut` changes where the answer comes from, not the answer."""
+    """Trajectories are the same with `tracking.shortcut`."""
     shortcut = attrs.evolve(SCENARIO, tracking=attrs.evolve(SCENARIO.tracking, shortcut=True))
     moves: dict[int, dict[Name, PlannedMove]] = {
         20: {ME: (1, (0, 1), (0, 0))},

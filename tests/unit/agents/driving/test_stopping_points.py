@@ -62,7 +62,7 @@ def test_the_bound_now_is_where_the_emergency_brake_acts_and_a_metre(
 def test_a_vehicle_ahead_is_predicted_with_an_acceleration_that_fades(
     own_mps: float, other_mps: float, other_mps2: float, gap_m: float
 ) -> None:
-    """The later bounds are those of the vehicle ahead where it is then, seen from there."""
+    """The bound after `SENSED_S` is the present one of a vehicle that is simulated until then."""
     bounds = bounds_of(state(own_mps, 0.0), Neighbour(0, gap_m, other_mps, other_mps2))
     if bounds is None:
         return

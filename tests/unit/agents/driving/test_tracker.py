@@ -416,7 +416,7 @@ def test_threads_have_programs_of_their_own() -> None:
     thread.join()
     assert found[0] is found[1]
     assert found[0] is not own
-    # Whichever thread has used or copied them before.
+    # Also after another thread has used or copied the tracker.
     assert tracker.program is copies[0].program is Tracker(SCENARIO, LIMITS).program is own
 
 
@@ -462,6 +462,6 @@ def test_the_reference_yields_to_bounds_of_stopping_points() -> None:
     behind = path[:, 0] + points.distances_m(path) - bounds
     assert behind[0] > 0.5
     assert (behind[later:] < 0.3).all()
-    # No harder than needed: a constant deceleration, reached with limited jerk.
+    # It brakes about as hard as needed; limited jerk delays and then increases the braking.
     needed = points.needed_decel_mps2(state, bounds)
     assert -1.3 * needed - 1.0 < path[:, 2].min() < -0.5 * needed

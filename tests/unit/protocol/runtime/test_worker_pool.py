@@ -205,7 +205,7 @@ def test_a_worker_that_goes_on_too_long_is_killed(
 def test_a_stopped_job_ends_and_its_worker_continues(
     one: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # It stops by itself, however busy the machine is.
+    # It stops by itself, also on a busy machine.
     monkeypatch.setattr(worker_pool, "STOP_S", WAIT_S)
     before = one.process_id()
     job = one.order(partial(jobs.read_clock, tmp_path / "begun"))
