@@ -178,10 +178,24 @@ workers = 1
         assert "Traceback" not in ended.err, ended
         return took_s
 
-    def workers(self, name: str) -> list[int]:
-        """Return the ids of a coordinator's workers, the forks of its fork server."""
-        children = psutil.Process(self.coordinators[name].pid).children()
-        return [worker.pid for server in children for worker in server.children()]
+    def worker(self, name: str, other_than: int = 0) -> int:
+        """Return the id of a coordinator's only worker, once there is no other process.
+
+        A worker that was replaced is a child of the fork server until it has freed its memory and
+        the server has reaped it.
+        """
+
+        def found() -> list[int]:
+            servers = psutil.Process(self.coordinators[name].pid).children()
+            return [worker.pid for server in servers for worker in server.children()]
+
+        def is_alone() -> bool:
+            workers = found()
+            return len(workers) == 1 and other_than not in workers
+
+        self.lab.wait_until(is_alone, END_S)
+        (worker,) = found()
+        return worker
 
     def rss_mb(self, name: str) -> float:
         """Return the memory of a coordinator's own process."""

@@ -37,7 +37,7 @@ def serve(lab: Lab) -> Iterator[Callable[..., ServiceLab]]:
 def busy(service: ServiceLab, deadline_s: float) -> Iterator[tuple[Future[str], psutil.Process]]:
     """Have c1 plan a request until its deadline; cancel it in the end if it has no answer."""
     process = psutil.Process(service.coordinators["c1"].pid)
-    worker = service.workers("c1")[0]
+    worker = service.worker("c1")
     spent_s = cpu_s(worker)
     asked = PlanRequest.from_dict(service.for_one("c1", slow_request("", deadline_s)))
     with PlanClient(service.access) as client, ThreadPoolExecutor(1) as pool:
@@ -55,7 +55,7 @@ def test_pending_requests_are_answered_while_others_take_new_ones(
     serve: Callable[..., ServiceLab],
 ) -> None:
     service = serve("30")
-    (idle,) = service.workers("c2")
+    idle = service.worker("c2")
     with busy(service, 6.0) as (answer, process):
         stopping = service.coordinators.pop("c1")
         os.killpg(stopping.pid, signal.SIGTERM)  # also the workers get it, as from `timeout`

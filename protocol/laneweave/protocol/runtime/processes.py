@@ -25,6 +25,8 @@ ROLE_STOP = signal.SIGUSR1
 REPEAT_S = 1.0
 """Time for which further stop signals count as repetitions: `timeout` sends SIGTERM to a process,
 and then to its whole group, and a shell passes on a SIGHUP that the terminal sends, too."""
+RAISE_AGAIN_S = 0.01
+"""Delay before a KeyboardInterrupt that Python has discarded is raised again."""
 _PR_SET_PDEATHSIG = 1
 _TERMINAL_LOST = 5
 """`errno.EIO`, which `termios` raises for a terminal that was closed."""
@@ -35,6 +37,8 @@ class _StopState:
 
     last_s = -float("inf")
     """Time of the last one."""
+    last: signal.Signals | int = signal.SIGINT
+    """The last one."""
     deferred = 0
     """Number of blocks of `interrupts_deferred` that are open."""
     pending = False
@@ -99,10 +103,16 @@ def accepted_stop_signals() -> list[signal.Signals]:
 
 
 def raise_interrupts(*numbers: signal.Signals) -> None:
-    """Raise KeyboardInterrupt in the main thread on signals that this process does not ignore."""
+    """Raise KeyboardInterrupt in the main thread on signals that this process does not ignore.
+
+    Python discards exceptions in finalizers and in callbacks of weak references, which it may run
+    at any moment; an interrupt there is raised again shortly afterwards (using SIGALRM).
+    """
     for number in numbers:
         if signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, _interrupt)
+    signal.signal(signal.SIGALRM, _repeat_discarded)
+    sys.unraisablehook = _on_discarded
 
 
 def stop_signal_received() -> bool:
@@ -134,8 +144,20 @@ def _interrupt(number: int, _frame: object) -> None:
         raise KeyboardInterrupt
 
 
+def _on_discarded(discarded: sys.UnraisableHookArgs) -> None:
+    if issubclass(discarded.exc_type, KeyboardInterrupt):
+        signal.setitimer(signal.ITIMER_REAL, RAISE_AGAIN_S)
+    else:
+        sys.__unraisablehook__(discarded)
+
+
+def _repeat_discarded(_number: int, _frame: object) -> None:
+    _StopState.last_s = -float("inf")
+    signal.raise_signal(_StopState.last)
+
+
 def _on_stop_signal(number: int) -> None:
-    _StopState.last_s = time.monotonic()
+    _StopState.last_s, _StopState.last = time.monotonic(), number
     if number == signal.SIGHUP:
         _release_lost_terminal()
 

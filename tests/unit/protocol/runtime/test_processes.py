@@ -8,6 +8,8 @@ import subprocess
 import sys
 import termios
 
+import pytest
+
 from support.commands import python
 
 PROGRAM = """
@@ -60,6 +62,31 @@ with p.interrupts_deferred():
     print("next")
 """
     assert said(body) == ["complete", "interrupted", "next"]
+
+
+@pytest.mark.parametrize("number", ["TERM", "INT"])
+def test_an_interrupt_where_python_discards_exceptions_is_raised_again(number: str) -> None:
+    body = f"""
+class Finalized:
+    def __del__(self):
+        send({number})
+p.raise_interrupts(TERM)
+try:
+    Finalized()
+    print("discarded")
+    time.sleep(60)
+except KeyboardInterrupt:
+    print("interrupted")
+time.sleep(0.1)
+class Failing:
+    def __del__(self):
+        raise ValueError("shown as ever")
+Failing()
+with p.stop_signals(lambda: print("stopped")):
+    p.signal.setitimer(signal.ITIMER_REAL, p.RAISE_AGAIN_S)
+    time.sleep(0.1)
+"""
+    assert said(body) == ["discarded", "interrupted", "stopped"]
 
 
 def test_all_stop_signals_stop_and_ignored_ones_stay_ignored() -> None:
