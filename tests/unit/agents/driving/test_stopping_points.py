@@ -57,7 +57,8 @@ def test_the_bound_now_is_where_the_emergency_brake_acts_and_a_metre(
     assert len(bounds) == N + 1
 
 
-@given(st.floats(5.0, 20.0), st.floats(0.0, 10.0), st.floats(-6.0, 4.0), st.floats(3.0, 20.0))
+# The vehicle ahead stays more than 2 m/s slower than v_F, so that the whole distance is kept.
+@given(st.floats(5.0, 20.0), st.floats(0.0, 10.0), st.floats(-6.0, 3.0), st.floats(3.0, 20.0))
 @examples(200)
 def test_a_vehicle_ahead_is_predicted_with_an_acceleration_that_fades(
     own_mps: float, other_mps: float, other_mps2: float, gap_m: float
@@ -73,7 +74,6 @@ def test_a_vehicle_ahead_is_predicted_with_an_acceleration_that_fades(
         accel -= accel * step_s / SENSED_S
     there = bounds_of(state(own_mps + 30.0, 0.0), Neighbour(0, gap_m + moved, speed, accel))
     assert there is not None
-    # The distance kept grows with the loss of speed, which is greater a second later.
     assert bounds[round(SENSED_S / TICK_S)] == pytest.approx(there[0], abs=0.1)
 
 
