@@ -12,6 +12,7 @@ from laneweave.protocol.vehicle.motion import State
 from laneweave.protocol.wire.messages import Name
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import Bodies, Pose, pose_of
 from laneweave.sim_bridge.road.demand import arrivals
+from laneweave.sim_bridge.road.obstacles import Breakdown
 from laneweave.sim_bridge.road.roadside import Roadside
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
 from support.convoy import ROLLING
@@ -68,6 +69,7 @@ class LonelyRoad:
     """Vehicles at the real roadside that no agent drives: they hold, and nothing else happens."""
 
     scenario: Scenario
+    breakdowns: tuple[Breakdown, ...] = ()
     roadside: Roadside = field(init=False)
     vehicles: dict[Name, RoadVehicle] = field(factory=dict)
     tick: int = 0
@@ -81,7 +83,9 @@ class LonelyRoad:
 
     def __attrs_post_init__(self) -> None:
         """Open the entrance, with the scenario's arrivals."""
-        self.roadside = Roadside(self.scenario, arrivals(self.scenario), bridge=1)
+        self.roadside = Roadside(
+            self.scenario, arrivals(self.scenario), bridge=1, breakdowns=self.breakdowns
+        )
 
     @property
     def t_s(self) -> float:
@@ -93,6 +97,7 @@ class LonelyRoad:
         self.roadside.demand.newly_demanded(t_s)
         for admission in self.roadside.admit(t_s, self.vehicles):
             vehicle = RoadVehicle.entering(admission, t_s, scenario, 1)
+            vehicle.close(self.roadside.lane_ends)
             self.vehicles[vehicle.name] = vehicle
         for change in self.roadside.control_lane_ends(self.vehicles, t_s):
             self.events.append((t_s, change.kind, change.vehicle))
@@ -120,5 +125,6 @@ class LonelyRoad:
         neighbours = bodies.exact_neighbours(road.lanes, road.lane_width_m, accels)
         for name, vehicle in self.vehicles.items():
             vehicle.perceive(neighbours[name])
-        pairs = [*bodies.overlapping_pairs(), *bodies.in_closed_lanes(self.scenario)]
+        closed = self.roadside.obstacles.without_vehicles(self.t_s)
+        pairs = [*bodies.overlapping_pairs(), *bodies.in_closed_lanes(self.scenario, closed)]
         self.overlaps += [(self.t_s, *pair) for pair in pairs]

@@ -11,11 +11,12 @@ from msgspec.structs import replace
 
 from laneweave.agents.core import AgentCore
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.road_layout import Exits
+from laneweave.protocol.road_layout import Exits, TemporaryClosure
 from laneweave.protocol.scenario.vehicle_types import VehicleTypes
 from laneweave.protocol.vehicle.lane_ends import LaneEnd, LaneEnds, ReEntry
 from laneweave.protocol.vehicle.plan_execution import PlanExecution
 from laneweave.protocol.wire.messages import Census, CensusEntry, Command, Name, Sense
+from laneweave.sim_bridge.bodies import motion_controller
 from laneweave.sim_bridge.bodies.motion_controller import MotionController, OffLatticePhase
 from laneweave.sim_bridge.bodies.stop_lines import StopLinesAhead
 from laneweave.sim_bridge.road import lane_end_control
@@ -27,6 +28,7 @@ from laneweave.sim_bridge.road.formation_building import (
     GrowingFormations,
 )
 from laneweave.sim_bridge.road.lane_end_control import LaneEndControl
+from laneweave.sim_bridge.road.obstacles import Obstacles
 from laneweave.sim_bridge.road.roadside import EntranceRoom, Roadside
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
 from support.bugs import Bug, breaks
@@ -36,7 +38,8 @@ Patch = pytest.MonkeyPatch
 Call = Callable[..., None]
 """A method that is replaced."""
 Vehicles = Mapping[Name, RoadVehicle]
-LANE_ENDS, RAMPS, FORMATIONS = "lane ends", "ramps, exits", "formations on roads"
+LANE_ENDS, OBSTACLES, RAMPS = "lane ends", "lanes closed for a time", "ramps, exits"
+FORMATIONS = "formations on roads"
 """What the bugs are about."""
 
 # --- leaving the lattice, and entering it again -----------------------------------------------
@@ -181,7 +184,7 @@ def last_first(waiting: Callable[..., list[object]], *given: object) -> list[obj
 def drives_on(leave_lattice: Call, self: MotionController) -> None:
     """A vehicle off the lattice aims at its cell, which is beyond the end of the lane."""
     leave_lattice(self)
-    self.off_lattice, self._stop_lines.passed = OffLatticePhase.RE_ENTERING, True
+    self.off_lattice, self.stop_lines.passed = OffLatticePhase.RE_ENTERING, True
 
 
 @breaks(LANE_ENDS)
@@ -191,7 +194,7 @@ def line_forgotten_when_driving_out(patch: Patch) -> None:
 
     def mutant(self: MotionController, cell: Cell) -> None:
         re_entry(self, cell)
-        self._stop_lines.passed = False
+        self.stop_lines.passed = False
 
     patch.setattr(MotionController, "re_enter", mutant)
     patch.setattr("laneweave.sim_bridge.bodies.stop_lines.STANDING_MPS", -1.0)
@@ -201,6 +204,62 @@ def line_forgotten_when_driving_out(patch: Patch) -> None:
 def full_lanes_are_entered(*_: object) -> set[int]:
     """Vehicles enter a lane whose queue reaches the entrance."""
     return set()
+
+
+# --- lanes that are closed for a time ---------------------------------------------------------
+
+
+@breaks(OBSTACLES)
+def parts_open_while_vehicles_wait(patch: Patch) -> None:
+    """A part is open again as soon as its cause is over, whoever waits there."""
+    patch.setattr(LaneEndControl, "in_use", frozenset())
+
+
+@breaks(OBSTACLES, Obstacles, "_with_room")
+def late_vehicles_have_no_room(
+    _: Call, self: Obstacles, part: TemporaryClosure, vehicles: Vehicles
+) -> TemporaryClosure:
+    """Vehicles that cannot stop at the stop line stand in the way of those at the line."""
+    del self, vehicles
+    return part
+
+
+@breaks(OBSTACLES, LaneEnds, "heeded")
+def late_vehicles_do_not_stop(_: Call, self: LaneEnds, lane: int, s_m: float, v: float) -> object:
+    """A vehicle for which the line comes too late does not stop before the part."""
+    end = self.ahead(lane, s_m)
+    return end if end is None or not end.sudden or s_m + v * v / 10.0 < end.stop_m else None
+
+
+@breaks(OBSTACLES, motion_controller, "stop_law")
+def broken_vehicles_drive_on(*_: object) -> tuple[float, float]:
+    """A vehicle that has broken down does not slow down."""
+    return 0.0, 0.0
+
+
+@breaks(OBSTACLES, Obstacles, "in_the_way")
+def parts_are_closed_around_vehicles(*_: object) -> tuple[int, int]:
+    """A part is closed while vehicles are in it."""
+    return 0, 0
+
+
+@breaks(OBSTACLES, LaneEndControl, "_is_over")
+def gaps_end_at_the_line(
+    is_over: Callable[..., bool], self: LaneEndControl, gap: object, _last_m: float, t_s: float
+) -> bool:
+    """A gap counts as passed once it has passed the stop line, not the first vehicle."""
+    line_m = min(end.line_m for end in self._ends.values())
+    return is_over(self, gap, line_m, t_s)
+
+
+@breaks(OBSTACLES, Roadside, "_lanes_past")
+def entrances_stay_open(*_: object) -> None:
+    """Vehicles enter although all lanes are closed."""
+
+
+@breaks(OBSTACLES, RoadVehicle, "close")
+def controllers_do_not_know(*_: object) -> None:
+    """Motion controllers do not learn which parts are closed."""
 
 
 # --- ramps and exits --------------------------------------------------------------------------

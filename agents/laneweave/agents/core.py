@@ -19,13 +19,14 @@ to be newer was wrong.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from msgspec.structs import replace
 
 from laneweave.agents.driving.driver import Driver, SolverStats, TrackingDriver
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell, PlannedMove, stretch_of
+from laneweave.protocol.road_layout import TemporaryClosure
 from laneweave.protocol.runtime.node import (
     Announce,
     Arrived,
@@ -130,6 +131,7 @@ class AgentCore:
         self._driver = make_driver(scenario, scenario.vehicle)
         self._drivable: frozenset[Cell] | None = None
         self._lane_ends, self._territory = LaneEnds(scenario), territory_of(scenario)
+        self._closed: tuple[TemporaryClosure, ...] = ()
         self._rules = rules
         self.wanted_motions: tuple[int, ...] = ()
         """Stretches of columns whose motions are needed now; empty while not in charge."""
@@ -196,6 +198,16 @@ class AgentCore:
             return
         if execution.needs_states(sense.t_s):
             self.wanted_states = execution.plan.blocks
+
+    def on_obstacles(self, closed: Sequence[TemporaryClosure]) -> None:
+        """Handle the parts of lanes that are closed now."""
+        if tuple(closed) == self._closed:
+            return
+        self._closed = tuple(closed)
+        self._lane_ends = LaneEnds(self._scenario, self._closed)
+        self._driver.close(self._lane_ends)
+        if self.execution is not None:
+            self.execution.lane_ends = self._lane_ends
 
     def on_motion(self, motion: Motion) -> None:
         """Handle the motion of a vehicle in one of the wanted stretches."""
@@ -272,6 +284,7 @@ class AgentCore:
         self._vehicle_type = vehicle_type
         self._drivable = types.moves_of(vehicle_type)
         self._driver = self._make_driver(self._scenario, types[vehicle_type].limits)
+        self._driver.close(self._lane_ends)
 
     def _has_lost_track(self, sense: Sense) -> bool:
         """Return whether the vehicle holds a cell to which this process has not moved it.
@@ -288,7 +301,10 @@ class AgentCore:
         if self._begun is None:
             return True
         (_, origin, target), _ = self._begun
-        return sense.hold_cell != origin or self._lane_ends.too_late(origin, target, sense.t_s)
+        # Before a part that is closed suddenly, the motion controller refuses a whole move.
+        slot_s = execution.plan.slot_s if self._closed and execution.plan is not None else None
+        late = self._lane_ends.too_late(origin, target, sense.t_s, slot_s)
+        return sense.hold_cell != origin or late
 
     def _wait(self, sense: Sense) -> list[Effect]:
         """Keep the claim on a vehicle without a cell, which its motion controller drives alone."""

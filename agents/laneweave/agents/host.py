@@ -28,10 +28,12 @@ from laneweave.protocol.runtime.node import (
 from laneweave.protocol.scenario.deployment_fields import Runtime, Shard
 from laneweave.protocol.wire.messages import Census, Motion, Name, Sense, VehicleState
 from laneweave.protocol.wire.newest import NewestRoad
+from laneweave.protocol.wire.obstacle_messages import Obstacles
 from laneweave.protocol.wire.topics import (
     BRIDGE_ALIVE,
     CENSUS,
     MOTION,
+    OBSTACLES,
     SENSE,
     STATE,
     Topic,
@@ -93,6 +95,7 @@ class AgentHost:
         """Time at which the bridge was lost; None: a bridge is up."""
         self._left: dict[Name, tuple[float, int]] = {}
         """When agents were told that their vehicles have left (node clock), and in which tick."""
+        self._obstacles: Obstacles | None = None
         self._solves = self._unusable = 0
         """Counters of agents that have been removed."""
 
@@ -143,7 +146,7 @@ class AgentHost:
         match event:
             case Started():
                 self._no_bridge_since_s = now_s
-                effects: list[Effect] = [Watch(BRIDGE_ALIVE)]
+                effects: list[Effect] = [Watch(BRIDGE_ALIVE), Listen(OBSTACLES)]
                 if self._shard is not None:
                     effects.append(Listen(CENSUS))
                 return effects + self._dispatch_to_all(event, now_s)
@@ -173,6 +176,9 @@ class AgentHost:
             if changed:
                 self._update_subscriptions(effects)
             return effects
+        if isinstance(message, Obstacles):
+            self._on_obstacles(message, now_s)
+            return []
         if isinstance(message, Census):
             effects = self._on_census(message, now_s)
             self._update_subscriptions(effects)
@@ -212,6 +218,9 @@ class AgentHost:
     def _leave_road(self) -> list[Effect]:
         """End all agents of a shard, because its road is another one."""
         effects: list[Effect] = []
+        self._obstacles = None
+        for agent in self._agents.values():
+            agent.on_obstacles(())
         if self._shard is not None:
             for name in list(self._agents):
                 effects += self._remove(name).leave()
@@ -245,7 +254,20 @@ class AgentHost:
         """Start the agent of a vehicle, perhaps of one that had not left although it was told."""
         self._left.pop(name, None)
         self._agents[name] = self._make_agent(name)
+        if self._obstacles is not None:
+            self._agents[name].on_obstacles(self._obstacles.closed)
         return list(self._agents[name].handle(Started(), now_s))
+
+    def _on_obstacles(self, message: Obstacles, now_s: float) -> None:
+        """Pass the parts of lanes that are closed now to all agents."""
+        self._bounds.check(message, self._road.latest_s(now_s), now_s)
+        newest = self._obstacles
+        if message.bridge not in (0, self._road.bridge) and self._road.bridge > 0:
+            return
+        if newest is None or message.bridge != newest.bridge or message.t_s >= newest.t_s:
+            self._obstacles = message
+            for agent in self._agents.values():
+                agent.on_obstacles(message.closed)
 
     def _on_census(self, census: Census, now_s: float) -> list[Effect]:
         effects: list[Effect] = []

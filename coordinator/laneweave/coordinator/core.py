@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import random
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any, ClassVar
@@ -57,6 +58,7 @@ from laneweave.protocol.wire.messages import (
     VehicleState,
 )
 from laneweave.protocol.wire.newest import NewestRoad
+from laneweave.protocol.wire.obstacle_messages import Obstacles
 from laneweave.protocol.wire.process_messages import LogEvent, Report
 from laneweave.protocol.wire.topics import (
     BRIDGE_ALIVE,
@@ -66,6 +68,7 @@ from laneweave.protocol.wire.topics import (
     COORDINATOR_ALIVE,
     EVENT,
     HEARTBEAT,
+    OBSTACLES,
     REPORT,
     SERVICE,
     SERVICE_CANCEL,
@@ -140,6 +143,8 @@ class CoordinatorCore:
         self._last_job = 0
         self._of_this_road = True
         """Whether the newest clock or census is of the newest road."""
+        self._obstacles_s = -math.inf
+        """Road time of the newest closed parts of lanes."""
         self._road_changed = True
         self._next_heartbeat_s = 0.0
         self._next_report_s = 0.0
@@ -228,7 +233,7 @@ class CoordinatorCore:
         match event:
             case Arrived(_, _, message):
                 self._bounds.check(message, road.latest_s(now_s), now_s)
-                if isinstance(message, (RoadClock, Census)):
+                if isinstance(message, (RoadClock, Census, Obstacles)):
                     self._of_this_road = road.on_message(message.bridge, message.t_s, now_s)
             case PeerUp(_, {"incarnation": _} as parameters):
                 incarnation = incarnation_of(parameters)
@@ -248,6 +253,7 @@ class CoordinatorCore:
         """Discard everything about another road, or about a road time that was wrong."""
         self._road_number = self._road.number
         self.census = None
+        self._obstacles_s = -math.inf
         self._formation_of = {}
         self.operation.forget()
 
@@ -293,6 +299,7 @@ class CoordinatorCore:
         yield Listen(HEARTBEAT)
         yield Listen(CLOCK)
         yield Listen(CENSUS)
+        yield Listen(OBSTACLES)
         yield Watch(COORDINATOR_ALIVE)
         yield Watch(BRIDGE_ALIVE)
         yield Watch(CLIENT_ALIVE)
@@ -315,12 +322,16 @@ class CoordinatorCore:
         match message:
             case Heartbeat():
                 self.election.on_heartbeat(message, now_s)
-            case RoadClock() | Census() if not self._of_this_road:
+            case RoadClock() | Census() | Obstacles() if not self._of_this_road:
                 pass
             case RoadClock():
                 self.election.limit_term(max_election_term(self.t_s))
                 self.operation.on_clock(self.t_s, now_s)
                 self._road_changed = True
+            case Obstacles():
+                if message.t_s >= self._obstacles_s:
+                    self._obstacles_s = message.t_s
+                    self.operation.on_obstacles(message.closed)
             case Census():
                 if self.census is None or message.t_s >= self.census.t_s:
                     self.census = message

@@ -7,12 +7,14 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 
 from attrs import define
+from msgspec import structs
 
 from laneweave.protocol.road_layout import Exits, LaneSection
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.summary import Ending
 from laneweave.protocol.wire.events import PLANNING_FAILED
 from laneweave.protocol.wire.messages import ClosedFormation, Heartbeat, Name
+from laneweave.protocol.wire.obstacle_messages import Obstacle
 from laneweave.protocol.wire.process_messages import LogEvent, Report
 from laneweave.sim_bridge.bodies.command_checks import Refusal
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import MinGaps
@@ -93,6 +95,10 @@ class EpisodeRecord:
     def on_lane_end(self, t_s: float, vehicle: Name, lane: int, kind: str) -> None:
         """Count that a vehicle has left the lattice at a dead end, or comes back."""
         self.event(t_s, kind, vehicle=vehicle, lane=lane)
+
+    def on_obstacle(self, t_s: float, kind: str, obstacle: Obstacle) -> None:
+        """Count that a part of a lane is closed for a time, or open again."""
+        self.event(t_s, kind, **structs.asdict(obstacle))
 
     def on_still_on_road(self, vehicle: RecordedVehicle) -> None:
         """Do nothing."""

@@ -9,10 +9,11 @@ reaches the end of the road has its own exit there; other exits have names.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from types import MappingProxyType
+from typing import NamedTuple
 
-from attrs import frozen
+from attrs import evolve, frozen
 
 LONGEST_ROAD_M = 60_000.0
 """Upper bound on positions on the road: the sum of those of its three segments."""
@@ -28,6 +29,16 @@ LaneChange = tuple[int, int]
 """(from, to) of neighbouring lanes."""
 _NO_EXITS: Mapping[LanePosition, str] = MappingProxyType({})
 _NO_RAMPS: Mapping[LanePosition, float] = MappingProxyType({})
+
+
+class TemporaryClosure(NamedTuple):
+    """A part of a lane that is closed for a time."""
+
+    lane: int
+    from_m: float
+    to_m: float
+    late_m: float = 0.0
+    """Length of the queue of vehicles that could not stop at the stop line, before the part."""
 
 
 @frozen
@@ -104,6 +115,26 @@ def _sections_of(
             from_m = open_m
     if from_m < length_m:
         yield section(length_m, end_exit(lane))
+
+
+def cut(
+    sections: Sequence[LaneSection], closed: Iterable[TemporaryClosure]
+) -> tuple[LaneSection, ...]:
+    """Return the sections of a road of which parts are closed for a time.
+
+    The last piece of a section keeps its number and its exit, since vehicles leave by numbers; a
+    piece before a closed part is a dead end, and is appended. Other parts are ignored.
+    """
+    pieces = list(sections)
+    for lane, from_m, to_m, _ in sorted(closed):
+        for number, section in enumerate(tuple(pieces)):
+            inside = section.from_m < to_m < section.to_m and from_m < to_m
+            if section.lane != lane or not inside:
+                continue
+            if from_m > section.from_m:
+                pieces.append(evolve(section, to_m=from_m, exit=""))
+            pieces[number] = evolve(section, from_m=to_m)
+    return tuple(pieces)
 
 
 def sections_for(

@@ -224,6 +224,21 @@ class LeaderChanges:
 
 
 @frozen(kw_only=True)
+class ObstacleFigures:
+    """A part of a lane that was closed for a time."""
+
+    cause: str = figure("breakdown: of a vehicle; closed: by an event of the road or an operator")
+    lane: int = figure("lane; 0 is the rightmost")
+    from_m: float = figure("beginning of the part", "m")
+    to_m: float = figure("end of the part", "m")
+    vehicle: str = figure("vehicle that broke down; empty: none")
+    since_s: float = figure("road time at which the part was closed", "s")
+    opened_s: float | None = optional("road time from which it was open again", "s")
+    stopped: int = figure("vehicles that left the lattice in its lane meanwhile", default=0)
+    waited_s: float = figure("sum of the times until they were in cells again", "s", default=0.0)
+
+
+@frozen(kw_only=True)
 class RunSummary:
     """The content of `summary.json`."""
 
@@ -249,6 +264,7 @@ class RunSummary:
     recorded_until_s: float | None = optional(
         "road time until which the run is recorded, if the disk failed", "s"
     )
+    obstacles: list[ObstacleFigures] | None = optional("parts of lanes closed for a time")
     planning: Planning
     tracking: Tracking
     runtime: RuntimeFigures

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from enum import Enum
 from itertools import groupby
 from typing import ClassVar
@@ -52,6 +52,7 @@ from laneweave.sim_bridge.recording.record_interface import Record
 from laneweave.sim_bridge.road.caretakers import notify_left
 from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.road.demand_queue import NO_OUTSIDE_TRAFFIC, OutsideTraffic
+from laneweave.sim_bridge.road.obstacles import Breakdown
 from laneweave.sim_bridge.road.roadside import Roadside
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
 from laneweave.sim_bridge.simulated_road import SimulatedRoad
@@ -148,6 +149,7 @@ class BridgeCore:
         incarnation: int = 0,
         stopwatch: Callable[[], float] = time.perf_counter,
         outside_traffic: OutsideTraffic = NO_OUTSIDE_TRAFFIC,
+        breakdowns: Iterable[Breakdown] = (),
     ) -> None:
         """Create the bridge before the first tick.
 
@@ -162,13 +164,16 @@ class BridgeCore:
             incarnation: distinguishes this road from earlier roads of the same deployment.
             stopwatch: clock [s] that measures how long ticks take.
             outside_traffic: further vehicles, which a simulator drives to entrances.
+            breakdowns: vehicles that break down.
         """
         self.phase = TickPhase.STARTING
         self._scenario = scenario
         self._world = world
         self._record = record
         self._new_incarnation = new_incarnation
-        self._roadside = Roadside(scenario, stream, incarnation, outside_traffic)
+        self._roadside = Roadside(
+            scenario, stream, incarnation, outside_traffic, breakdowns=breakdowns
+        )
         self.road = SimulatedRoad(
             scenario, self._roadside, record, new_incarnation, RoadVehicle.entering, incarnation
         )
@@ -382,7 +387,8 @@ class BridgeCore:
         road = self.road
         self._record.on_missed(self._answers.close())
         road.step()
-        show_bodies(self._world, road.vehicles, self._scenario, self._record, road.t_s)
+        closed = self._roadside.obstacles.without_vehicles(road.t_s)
+        show_bodies(self._world, road.vehicles, self._scenario, self._record, road.t_s, closed)
         for vehicle in road.departed():
             self._world.remove(vehicle.name)
             self._departures.append((road.tick, vehicle.name))

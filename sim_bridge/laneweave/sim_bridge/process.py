@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterable
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from laneweave.protocol.transports.zenoh.runner import run_core
 from laneweave.protocol.wire.identities import Incarnations
 from laneweave.sim_bridge.core import BridgeCore
 from laneweave.sim_bridge.recording.run_record import RunRecord
+from laneweave.sim_bridge.road.obstacles import Breakdown
 from laneweave.sim_bridge.road_sources import demand_of, open_road
 
 
@@ -26,6 +28,7 @@ def run_bridge(
     pace: float | None,
     wrap: CoreWrapper = unwrapped,
     observe: Observe = unobserved,
+    breakdowns: Iterable[Breakdown] = (),
 ) -> None:
     """Run the simulated world until all vehicles have left, or until SIGINT or SIGTERM.
 
@@ -36,6 +39,7 @@ def run_bridge(
         pace: maximum road seconds per wall-clock second; None: the scenario's.
         wrap: wraps the core, to inject faults.
         observe: registers the metrics source.
+        breakdowns: vehicles that break down.
 
     Raises:
         BadInputError: no router answers at the scenario's endpoint.
@@ -56,6 +60,7 @@ def run_bridge(
                 pace=pace,
                 incarnation=incarnations(),
                 outside_traffic=road.outside_traffic,
+                breakdowns=breakdowns,
             )
             # Also after an error, to save the recorded data.
             closing.callback(lambda: record.close(core.t_s, Ending.INTERRUPTED))

@@ -159,13 +159,17 @@ class SimulatedRoad(Generic[VehicleT]):
         entered, self.at_entrance = self.at_entrance, []
         for vehicle in entered:
             vehicle.controller.occupancy = self._occupied_cells
+            vehicle.close(self._roadside.lane_ends)
             self.vehicles[vehicle.name] = vehicle
             self._record.on_entered(vehicle)
         return entered
 
     def begin_tick(self, now_s: float) -> Iterator[Effect]:
         """Begin a tick, after vehicles have entered."""
-        for change in self._roadside.control_lane_ends(self.vehicles, self.t_s):
+        changes = self._roadside.control_lane_ends(self.vehicles, self.t_s)
+        for kind, obstacle in self._roadside.pop_obstacle_changes():
+            self._record.on_obstacle(self.t_s, kind, obstacle)
+        for change in changes:
             self.caretakers.begin_anew(self.vehicles[change.vehicle], self.tick)
             self._record.on_lane_end(self.t_s, change.vehicle, change.lane, change.kind)
         self._close_formations()

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Protocol
 
+from laneweave.protocol.road_layout import TemporaryClosure
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.motion import State
 from laneweave.protocol.wire.messages import CAR, Name
@@ -53,10 +54,11 @@ def show_bodies(
     scenario: Scenario,
     record: Record,
     t_s: float,
+    closed: Iterable[TemporaryClosure] = (),
 ) -> None:
     """Display all bodies after a tick, record their poses and update all sensors.
 
-    `t_s` is the road time after the tick.
+    `t_s` is the road time after the tick; `closed` are parts of lanes in which no body may be now.
     """
     states = {name: vehicle.state for name, vehicle in vehicles.items()}
     for name, state in states.items():
@@ -83,7 +85,7 @@ def show_bodies(
         vehicles.values(),
         overlaps=[
             *bodies.overlapping_pairs(),
-            *bodies.in_closed_lanes(scenario),
+            *bodies.in_closed_lanes(scenario, closed),
             *touching,
         ],
         collisions=world.collisions(),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from typing import Any
 
@@ -24,6 +25,7 @@ from laneweave.protocol.wire.messages import (
     Prepare,
     VehicleState,
 )
+from laneweave.protocol.wire.obstacle_messages import Obstacle, Obstacles
 from laneweave.protocol.wire.process_messages import Report
 from support.paper import PAPER
 from support.states import BALLOT, make_plan, sense_in, sent
@@ -272,6 +274,44 @@ def test_what_is_no_newer_bridge_changes_nothing(other: str) -> None:
     assert give(shard, census(A)) == []  # it has the vehicle still
 
 
+def closed(
+    t_s: float, *lanes: int, bridge: int = 7, from_m: float = 600.0, to_m: float = 650.0
+) -> node.Arrived:
+    parts = tuple(Obstacle(lane, from_m, to_m) for lane in lanes)
+    return node.Arrived(topics.OBSTACLES, {}, Obstacles(t_s, parts, bridge))
+
+
+def known_to(host: AgentHost, vehicle: Name) -> set[int]:
+    """Return the lanes of whose ends an agent knows."""
+    return {end.lane for end in host._agents[vehicle]._lane_ends}
+
+
+def test_agents_know_the_newest_closed_parts_of_their_road() -> None:
+    host = make_host(A)
+    give(host, node.Started())
+    give(host, node.PeerUp(topics.BRIDGE_ALIVE, {"incarnation": "7"}))
+    give(host, closed(1.0, 1))
+    assert known_to(host, A) == {1}
+    give(host, closed(3.0, 2))
+    give(host, closed(2.0, 0))  # late
+    give(host, closed(4.0, 0, bridge=6))  # of another road
+    assert known_to(host, A) == {2}
+    give(host, closed(5.0))
+    assert known_to(host, A) == set()
+
+
+def test_agents_that_start_later_know_them_and_absurd_parts_change_nothing() -> None:
+    host = make_host(A)
+    give(host, node.Started())
+    give(host, closed(1.0, 1, 9, -3, bridge=0))
+    give(host, closed(2.0, 1, 9, bridge=0))
+    host._start(B, 0.0)
+    assert known_to(host, B) == {1}
+    for from_m, to_m in ((650.0, 600.0), (900.0, 5000.0), (math.nan, math.nan)):
+        give(host, closed(3.0, 1, bridge=0, from_m=from_m, to_m=to_m))
+        assert known_to(host, B) == set()
+
+
 def test_a_shard_lets_go_of_vehicles_that_the_census_lacks() -> None:
     host = make_host(shard=Shard(0, 1))
     give(host, census(A, B))
@@ -303,6 +343,7 @@ def test_a_shard_takes_announced_vehicles_and_those_on_the_road_once() -> None:
     for host in shards:
         assert give(host, node.Started()) == [
             node.Watch(topics.BRIDGE_ALIVE),
+            node.Listen(topics.OBSTACLES),
             node.Listen(topics.CENSUS),
         ]
         assert host.wakeup_s is None

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
+import structlog
 from structlog.testing import capture_logs
 
 from laneweave.protocol.scenario.deployment_fields import Shard
@@ -17,6 +19,12 @@ EAST, WEST = VEHICLES[::2], VEHICLES[1::2]
 
 def fleet_of(vehicle: str) -> str:
     return "east" if int(vehicle[1:]) % 2 else "west"
+
+
+@pytest.fixture(autouse=True)
+def _all_levels_are_logged() -> None:
+    """Other tests of the same worker may have set a level."""
+    structlog.reset_defaults()
 
 
 def test_a_fleet_that_is_lost_is_one_line() -> None:

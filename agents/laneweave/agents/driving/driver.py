@@ -24,6 +24,7 @@ from laneweave.agents.driving.tracking_problem import NO_GAPS
 from laneweave.protocol.lattice import Cell, PlannedMove
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.vehicle_tables import Vehicle
+from laneweave.protocol.vehicle.lane_ends import LaneEnds
 from laneweave.protocol.vehicle.motion import (
     State,
     at_rest_in_cell,
@@ -81,6 +82,9 @@ class Driver(Protocol):
 
     def on_motion(self, motion: Motion) -> None:
         """Handle another vehicle's announced motion."""
+
+    def close(self, lane_ends: LaneEnds) -> None:
+        """Replace the ends of lanes: parts of lanes are closed for a time."""
 
     @property
     def solver_stats(self) -> SolverStats:
@@ -168,7 +172,7 @@ class TrackingDriver:
         window = None
         if self._stop_lines:
             window = reference.window(tick)
-            gaps = self._stop_lines.limit(gaps, window.states, sense.measured[0])
+            gaps = self._stop_lines.limit(gaps, window.states, sense.measured)
         result = None
         if self._shortcut and gaps is NO_GAPS and tick >= reference.end_tick:
             goal = cell_state(self._lattice, self._goal, sense.t_s)
@@ -200,6 +204,10 @@ class TrackingDriver:
     def on_motion(self, motion: Motion) -> None:
         """Handle another vehicle's announced motion."""
         self._surroundings.on_motion(motion)
+
+    def close(self, lane_ends: LaneEnds) -> None:
+        """Replace the ends of lanes: parts of lanes are closed for a time."""
+        self._stop_lines.ends = lane_ends
 
     def _commanded(self, sense: Sense) -> State:
         return commanded_state(sense.measured, sense.setpoint, self._limits, self._speed_mps)

@@ -16,6 +16,7 @@ from laneweave.agents.driving.tracking_problem import Gaps
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.vehicle_tables import Vehicle
 from laneweave.protocol.vehicle.lane_ends import LaneEnd, LaneEnds
+from laneweave.protocol.vehicle.motion import State
 
 Array = NDArray[np.float64]
 
@@ -25,7 +26,7 @@ class StopLines:
 
     def __init__(self, scenario: Scenario, limits: Vehicle) -> None:
         """Read the lines from a scenario."""
-        self._ends = LaneEnds(scenario)
+        self.ends = LaneEnds(scenario)
         self._lattice = scenario.lattice
         self._touch_m = 0.5 * (scenario.road.lane_width_m + limits.width_m)
         # In commanded positions: a standing body is this far ahead of its commanded state.
@@ -35,15 +36,15 @@ class StopLines:
 
     def __bool__(self) -> bool:
         """Return whether there are any."""
-        return bool(self._ends)
+        return bool(self.ends)
 
-    def limit(self, gaps: Gaps, states: Array, s_m: float) -> Gaps:
+    def limit(self, gaps: Gaps, states: Array, measured: State) -> Gaps:
         """Return the gaps, with stop lines as upper bounds where the reference would pass them.
 
         Args:
             gaps: bounds set by other vehicles.
             states: states of the reference (N + 1, 6).
-            s_m: measured position of the front bumper.
+            measured: measured state of the body.
         """
         lines = [
             (
@@ -52,7 +53,7 @@ class StopLines:
                 # The reference may lead into the lane where it is open again.
                 & (states[:, 0] < end.reopens_m),
             )
-            for end in self._ahead(s_m)
+            for end in self._ahead(measured)
         ]
         latest = gaps.latest
         for end, touching in lines:
@@ -63,7 +64,8 @@ class StopLines:
             latest = limit if latest is None else np.minimum(latest, limit)
         return gaps if latest is gaps.latest else evolve(gaps, latest=latest)
 
-    def _ahead(self, s_m: float) -> list[LaneEnd]:
-        """Return the dead end ahead of a position in each lane that has one."""
-        lanes = range(self._lattice.lanes)
-        return [end for lane in lanes if (end := self._ends.ahead(lane, s_m)) is not None]
+    def _ahead(self, measured: State) -> list[LaneEnd]:
+        """Return the dead end ahead of a body in each lane that has one."""
+        lanes, (s_m, speed_mps) = range(self._lattice.lanes), measured[:2]
+        ends = (self.ends.heeded(lane, s_m, speed_mps) for lane in lanes)
+        return [end for end in ends if end is not None]

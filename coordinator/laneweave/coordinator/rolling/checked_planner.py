@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 from functools import partial
 
 from attrs import evolve
@@ -10,6 +10,7 @@ from attrs import evolve
 from laneweave.coordinator.planning.conflict_kinds import ConflictModel
 from laneweave.coordinator.planning.kernels import ROLLING
 from laneweave.coordinator.planning.rolling.problem import (
+    Sections,
     StreamCosts,
     StreamPlan,
     StreamRoad,
@@ -19,6 +20,7 @@ from laneweave.coordinator.planning.rolling.rolling_validator import problems_of
 from laneweave.protocol.lattice import Cell, Mode
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.formation_table import READY_LATE_S
+from laneweave.protocol.scenario.road_geometry import first_moves_m
 from laneweave.protocol.vehicle.lane_ends import early_start_m, sections_to_lines
 
 REWARD = -0.5
@@ -26,10 +28,10 @@ REWARD = -0.5
 
 
 Planner = Callable[
-    [int, Sequence[StreamVehicle], StreamPlan | None, Collection[Cell], Mapping[int, float]],
+    [int, Sequence[StreamVehicle], StreamPlan | None, Collection[Cell], Sections | None],
     StreamPlan,
 ]
-"""Function of slot, vehicles, previous plan, blocked cells and earlier ends of sections.
+"""Function of slot, vehicles, previous plan, blocked cells and sections that are open now.
 
 It returns paths for all vehicles from that slot on; `StreamPlanner.plan` except in fault searches
 and tests."""
@@ -50,10 +52,10 @@ def _checked_plan(
     vehicles: Sequence[StreamVehicle],
     before: StreamPlan | None,
     blocked: Collection[Cell],
-    ends_m: Mapping[int, float],
+    sections: Sections | None,
 ) -> StreamPlan:
-    table = planner(slot, vehicles, before, blocked, ends_m)
-    problems = problems_of_plan(road.ending_at(ends_m), table, vehicles, blocked)
+    table = planner(slot, vehicles, before, blocked, sections)
+    problems = problems_of_plan(road.with_sections(sections), table, vehicles, blocked)
     if problems:
         raise ValueError(f"the plan of slot {slot} is invalid: {'; '.join(problems)}")
     return table
@@ -79,7 +81,11 @@ def stream_road(scenario: Scenario) -> StreamRoad:
     mode: Mode = 1 if formation.mode == 1 else 2
     # A vehicle that settles may begin a move late, and ahead of its cell.
     ahead_m = formation.speed_mps * READY_LATE_S + scenario.types.room_ahead_m
+    around_m = first_moves_m(
+        road.s1_m, road.s2_m, formation.speed_mps, formation.settle_s, in_s2=True
+    )
     return StreamRoad(
+        around_m=around_m,
         lanes=road.lanes,
         pitch_m=formation.gap_m,
         advance_m=formation.speed_mps * scenario.timing.cycles_s[0],

@@ -10,17 +10,18 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from attrs import frozen
+from attrs import evolve, frozen
 
 from laneweave.coordinator.ballots.ballot_round import BallotPhase
-from laneweave.coordinator.planning.rolling.problem import StreamVehicle
+from laneweave.coordinator.planning.rolling.problem import Sections, StreamVehicle
 from laneweave.coordinator.rolling.observed import Snapshot
 from laneweave.coordinator.rolling.ownership import certain_cells
 from laneweave.coordinator.rolling.transfer import CellTransfer
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.road_layout import ANY_LANE, END_OF_ROAD
+from laneweave.protocol.road_layout import ANY_LANE, END_OF_ROAD, LaneSection, TemporaryClosure
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.formation_table import READY_LATE_S
+from laneweave.protocol.vehicle.lane_ends import sections_to_lines
 from laneweave.protocol.vehicle.motion import DISPLACED_ALONG_M
 from laneweave.protocol.wire.messages import CensusEntry, Name, VehicleState
 
@@ -54,7 +55,7 @@ class KnownRoad:
         """Return the vehicles to plan for, and the cells that no plan may use.
 
         Args:
-            transfers: ballots for the slot before.
+            transfers: ballots for the slot before, and for this slot if it is planned again.
         """
         snapshot, lattice = self.snapshot, self.scenario.lattice
         vehicles: dict[Cell, StreamVehicle] = {}
@@ -85,21 +86,58 @@ class KnownRoad:
         )
         return tuple(vehicles.values()), blocked
 
-    def section_ends_m(self) -> dict[int, float]:
-        """Return where sections end before vehicles without cells or agents [m], by index."""
-        ends_m: dict[int, float] = {}
-        on_road = self.snapshot.census.on_road
+    def open_sections(self, closed: Sequence[TemporaryClosure] = ()) -> Sections:
+        """Return the sections as plans may use them now.
+
+        They end before parts that are closed for a time, and before vehicles without cells or
+        agents. Behind a closed part, a section begins so late that no vehicle can pass the part
+        within a slot.
+        """
+        scenario, census = self.scenario, self.snapshot.census
+        always = len(scenario.geometry.sections)
+        sections = list(sections_to_lines(scenario, closed))
+        jump_m = scenario.formation.speed_mps * self._slot_s + scenario.lattice.pitch_m
+        for number, section in enumerate(sections[:always]):
+            before = [each.to_m for each in sections[always:] if each.lane == section.lane]
+            ends_m = [to_m for to_m in before if to_m < section.from_m]
+            if ends_m:
+                from_m = min(max(section.from_m, max(ends_m) + jump_m), section.to_m)
+                sections[number] = evolve(section, from_m=from_m)
+        on_road = census.on_road
         bodies = [entry.off_lattice for entry in on_road if entry.off_lattice is not None]
-        bodies += self.snapshot.census.ends
-        for number, section in enumerate(self.scenario.geometry.sections):
+        bodies += census.ends
+        for number, section in enumerate(sections):
             inside = [
                 body.rear_m
                 for body in bodies
                 if body.lane == section.lane and section.from_m <= body.rear_m < section.to_m
             ]
             if inside:
-                ends_m[number] = min(inside)
-        return ends_m
+                sections[number] = evolve(section, to_m=min(inside))
+            if number >= always:
+                queue_m = self._queue_begins_m(sections[number])
+                sections[number] = evolve(sections[number], to_m=queue_m)
+        return tuple(sections)
+
+    def _queue_begins_m(self, section: LaneSection) -> float:
+        """Return where moves out of a section end that is closed suddenly.
+
+        Vehicles that can no longer leave it will queue. A vehicle that reached the queue while it
+        changes lanes would stop in both lanes.
+        """
+        scenario, begins_m = self.scenario, section.to_m
+        lattice, states = scenario.lattice, self.snapshot.states
+        queue_m = scenario.types.longest_body_m + scenario.tracking.min_gap_m
+        cells = (
+            states[entry.vehicle].hold_cell if entry.vehicle in states else entry.cell
+            for entry in self.snapshot.census.on_lattice
+        )
+        t_s, advance_m = self.slot * self._slot_s, lattice.speed_mps * self._slot_s
+        inside = (lattice.cell_s_m(column, t_s) for column, lane in cells if lane == section.lane)
+        for s_m in sorted(inside, reverse=True):
+            if s_m > begins_m - advance_m and s_m - advance_m < section.to_m:
+                begins_m -= queue_m
+        return max(begins_m, section.from_m)
 
     def _vehicle(
         self, entry: CensusEntry, state: VehicleState | None, s_m: float, *, gated: bool
@@ -134,9 +172,11 @@ class KnownRoad:
         return set()
 
     def _gated(self, transfers: Sequence[CellTransfer]) -> frozenset[Name]:
-        """Return members of ballots for the slot before whose gates wait for a settling vehicle.
+        """Return members of ballots that are in force, and whose gates may not have opened.
 
-        If one of them promised the next ballot, the gate would stay closed.
+        These are ballots for this slot, which is planned again, and ballots for the slot before
+        whose gates wait for a settling vehicle. If one of them promised the next ballot, the gate
+        would stay closed.
         """
         t0_s, states = (self.slot - 1) * self._slot_s, self.snapshot.states
         settling = {one.vehicle for one in self.snapshot.census.on_lattice if one.ready_s > t0_s}
@@ -145,8 +185,13 @@ class KnownRoad:
             for transfer in transfers
             if transfer.phase is BallotPhase.IN_FORCE
             and transfer.t0_s >= t0_s - 1e-6
-            and not settling.isdisjoint(transfer.roster)
-            and not any(states[one].go for one in transfer.roster if one in states)
+            and (
+                transfer.t0_s > self.t_s
+                or (
+                    not settling.isdisjoint(transfer.roster)
+                    and not any(states[one].go for one in transfer.roster if one in states)
+                )
+            )
             for name in transfer.roster
         )
 

@@ -10,7 +10,7 @@ starts from its cell.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from typing import Any
 
@@ -24,6 +24,7 @@ from laneweave.coordinator.rolling.observed import ObservedRoad
 from laneweave.coordinator.rolling.ownership import certain_cells, partners
 from laneweave.coordinator.rolling.transfer import TRANSFER_RULES, CellTransfer
 from laneweave.protocol.lattice import footprint
+from laneweave.protocol.road_layout import TemporaryClosure
 from laneweave.protocol.runtime.node import Clock, Compute, Computed, Effect
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.formation_table import SNAPSHOT_S
@@ -49,6 +50,9 @@ LISTEN_S = 0.5
 heartbeats it has missed."""
 MAX_DELAY_S = 1.0
 """Time into its slot after which a plan that is not in force is dropped."""
+
+AGAIN_S = 1.4
+"""Time before a slot until which it is planned again if other parts of lanes are closed."""
 
 
 class RollingOperation:
@@ -87,12 +91,16 @@ class RollingOperation:
         """Id of the computation in progress, and index of the slot that it plans."""
         self._newest_slot = -1
         self._last_plan: StreamPlan | None = None
+        self._closed: tuple[TemporaryClosure, ...] = ()
+        self._closed_changed = False
+        """Whether these parts have changed since the last plan."""
 
     def forget(self) -> None:
         """Discard everything: the road is new."""
         self.take_over()
         self.observed.forget()
         self._last_plan, self._newest_slot = None, -1
+        self._closed, self._closed_changed = (), False
 
     def take_over(self) -> None:
         """Reset: listen for `LISTEN_S` before planning, and drop the ballots of the earlier term.
@@ -106,6 +114,11 @@ class RollingOperation:
 
     def on_clock(self, t_s: float, now_s: float) -> None:
         """Ignore the clock message: only road time determines when plans are due."""
+
+    def on_obstacles(self, closed: Sequence[TemporaryClosure]) -> None:
+        """Handle the parts of lanes that are closed now."""
+        if tuple(closed) != self._closed:
+            self._closed, self._closed_changed = tuple(closed), True
 
     def on_state(self, state: VehicleState, now_s: float) -> list[LogEntry] | None:
         """Handle the state of a vehicle; return None if no unfinished ballot depends on it."""
@@ -168,6 +181,8 @@ class RollingOperation:
             return
         slot = math.floor(t_s / self._slot_s + 1e-9)
         snapshot_s = slot * self._slot_s + SNAPSHOT_S + 1e-6
+        if self._closed_changed and t_s < self._newest_slot * self._slot_s - AGAIN_S:
+            self._newest_slot = slot
         if slot < self._newest_slot or t_s <= snapshot_s or now_s < self._since[1] + LISTEN_S:
             return
         if max(self._since[0], t_s - 1.5 * self._scenario.runtime.tick_s) > snapshot_s:
@@ -175,12 +190,18 @@ class RollingOperation:
         known = KnownRoad(
             self._scenario, self.observed.at(snapshot_s), snapshot_s, slot + 1, self._since[0]
         )
+        self._closed_changed = False
         vehicles, blocked = known.vehicles_and_blocked_cells(self.transfers)
         self._newest_slot = slot + 1
         job = self._new_job()
         self._ordered = (job, slot + 1)
         plan = partial(
-            self._planner, slot + 1, vehicles, self._last_plan, blocked, known.section_ends_m()
+            self._planner,
+            slot + 1,
+            vehicles,
+            self._last_plan,
+            blocked,
+            known.open_sections(self._closed),
         )
         yield Compute(job, partial(_without_deadline, plan))
 
@@ -191,6 +212,11 @@ class RollingOperation:
         slot = self._ordered[1]
         self._ordered = None
         yield from self._abort(self.transfers, "the next slot is planned")
+        in_force = [
+            each
+            for each in self.transfers
+            if each.phase is BallotPhase.IN_FORCE and each.t0_s > slot * self._slot_s - 1e-6
+        ]
         plan = computed.result
         if not isinstance(plan, StreamPlan):
             yield LogEntry(PLANNING_FAILED, {"slot": slot, "error": computed.error})
@@ -201,7 +227,7 @@ class RollingOperation:
         if t_s > t0_s + MAX_DELAY_S:
             yield LogEntry(PLANNING_LATE, {"slot": slot})
             return
-        self.transfers = list(self._make_transfers(plan, t0_s, now_s))
+        self.transfers = [*in_force, *self._make_transfers(plan, t0_s, now_s)]
         self._transfer_of = {name: each for each in self.transfers for name in each.roster}
         out_of_reach = [name for name in plan.missed if name not in known]
         yield LogEntry(STREAM_PLANNED, self._log_data(plan) | {"out_of_reach": out_of_reach})

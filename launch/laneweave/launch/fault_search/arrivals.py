@@ -8,9 +8,9 @@ preferred lane, which may be full.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 
-from laneweave.coordinator.planning.rolling.problem import StreamPlan, StreamVehicle
+from laneweave.coordinator.planning.rolling.problem import Sections, StreamPlan, StreamVehicle
 from laneweave.coordinator.rolling.checked_planner import Planner
 from laneweave.launch.fault_search.checks.checker import Checker
 from laneweave.launch.fault_search.road.light_road import LightRoad
@@ -75,9 +75,9 @@ class Arrivals:
             vehicles: Sequence[StreamVehicle],
             before: StreamPlan | None,
             blocked: Collection[Cell],
-            ends_m: Mapping[int, float],
+            sections: Sections | None,
         ) -> StreamPlan:
-            table = planner(slot, vehicles, before, blocked, ends_m)
+            table = planner(slot, vehicles, before, blocked, sections)
             if self.healed:
                 self._planned_slots += 1
                 paths = table.paths.items()

@@ -1,8 +1,8 @@
 """The fault specification of a run: the format of fault files (reference: docs/FAULTS.md).
 
-A file has any number of tables `[[messages]]`, `[[kill]]`, `[[pause]]`, `[[partition]]` and
-`[[link]]`. Faults begin at a road time; durations are in wall-clock time. The package contains
-preset files, which are selected by name.
+A file has any number of tables `[[messages]]`, `[[kill]]`, `[[pause]]`, `[[partition]]`,
+`[[link]]` and `[[breakdown]]`. Faults begin at a road time; durations are in wall-clock time, those
+of breakdowns in road time. The package contains preset files, which are selected by name.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ from laneweave.protocol.errors import (
 )
 from laneweave.protocol.field_validators import one_of, within
 from laneweave.protocol.names import span_of
+from laneweave.protocol.road_layout import LONGEST_ROAD_M
 from laneweave.protocol.runtime.message_faults import SENDERS, MessageRule
 from laneweave.protocol.structuring import NumberOrRange, structure
 
@@ -268,6 +269,34 @@ class LinkFault(TimedFault):
 
 
 @frozen(kw_only=True)
+class BreakdownFault:
+    """Let vehicles break down: their bodies slow down in their lanes, and stand.
+
+    Raises:
+        BadInputError: values contradict each other.
+    """
+
+    at_s: float = field(validator=within(0.0, MAX_S))
+    """Road time from which they may break down; a vehicle that moves or settles ends that first."""
+    vehicle: str | None = None
+    """Name of the vehicle; None: vehicles that fit the following fields are drawn."""
+    count: int = field(default=1, validator=within(1, 100))
+    """Number of vehicles; 1 with `vehicle`."""
+    lane: int | None = field(default=None, validator=optional(within(0, 7)))
+    """Lane of the vehicles; None: any."""
+    at_m: float | None = field(default=None, validator=optional(within(0.0, LONGEST_ROAD_M)))
+    """The vehicles are the first ones beyond this position; None: anywhere."""
+    decel_mps2: float = field(default=3.0, validator=within(0.5, 10.0))
+    for_s: float | None = field(default=None, validator=optional(within(0.0, MAX_S)))
+    """Road time for which they stand; None: for ever."""
+
+    def __attrs_post_init__(self) -> None:
+        """Check that the fields do not contradict each other."""
+        if self.vehicle is not None and self.count > 1:
+            raise BadInputError("count", self.count, "1 with vehicle")
+
+
+@frozen(kw_only=True)
 class FaultSpec:
     """All faults of a run."""
 
@@ -278,10 +307,12 @@ class FaultSpec:
     pause: tuple[Pause, ...] = ()
     partition: tuple[Partition, ...] = ()
     link: tuple[LinkFault, ...] = ()
+    breakdown: tuple[BreakdownFault, ...] = ()
 
     def __bool__(self) -> bool:
         """Return whether there are any faults."""
-        return bool(self.messages or self.kill or self.pause or self.partition or self.link)
+        faults = self.messages, self.kill, self.pause, self.partition, self.link, self.breakdown
+        return any(faults)
 
     def seed_of_run(self, scenario_seed: int) -> int:
         """Return the seed for all random draws: the file's, or else that of the scenario."""
@@ -297,6 +328,11 @@ class FaultSpec:
         """Yield partitions with their names."""
         for index, partition in enumerate(self.partition):
             yield f"partition[{index}]", partition
+
+    def breakdowns(self) -> Iterator[tuple[str, BreakdownFault]]:
+        """Yield breakdowns with their names."""
+        for index, fault in enumerate(self.breakdown):
+            yield f"breakdown[{index}]", fault
 
     def timed_faults(self) -> Iterator[tuple[str, Partition | LinkFault]]:
         """Yield partitions and faults of links with their names."""
@@ -343,6 +379,7 @@ class FaultSpec:
             ("messages", self.messages, "only a process itself can lose or delay messages"),
             ("partition", self.partition, "only processes themselves can lose messages"),
             ("link", self.link, "only links that `laneweave run` has made lose packets"),
+            ("breakdown", self.breakdown, "the bridge lets vehicles break down"),
         ):
             if faults:
                 allowed = f"nothing {where}: {why} (laneweave run --faults)"
@@ -429,6 +466,10 @@ def _unknown_targets(
         if not known and vehicles is not None and fault.target not in vehicles:
             allowed = _or_a_vehicle(kinds, vehicles)
             yield unknown_name(f"{name}.target", fault.target, kinds, allowed)
+    for name, breakdown in specification.breakdowns():
+        if None not in (vehicles, breakdown.vehicle) and breakdown.vehicle not in (vehicles or ()):
+            allowed = f"the name of a vehicle of the run: {span_of(vehicles or ())}"
+            yield BadInputError(f"{name}.vehicle", breakdown.vehicle, allowed)
 
 
 def _or_a_vehicle(kinds: Collection[str], vehicles: Collection[str] | None) -> str:

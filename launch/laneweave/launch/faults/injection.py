@@ -217,7 +217,13 @@ class FaultInjection:
         faults: dict[str, Any] = {"injected": self.injected, "partition_methods": methods}
         if self.no_network_reason:
             faults["why_no_namespaces"] = self.no_network_reason
-        return {"failover": self.failover, "dropped": dropped, "faults": faults}
+        breakdowns = sum(fault.count for _, fault in self.specification.breakdowns())
+        return {
+            "failover": self.failover,
+            "dropped": dropped,
+            "faults": faults,
+            "breakdowns": breakdowns,
+        }
 
     def close(self) -> None:
         """Release the network namespaces; call this after all roles have exited."""

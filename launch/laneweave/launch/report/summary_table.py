@@ -13,7 +13,14 @@ from laneweave.launch.run_methods import FORMATION
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.operations import ROLLING_SOLVER
 from laneweave.protocol.scenario.timing import COMFORT_MPS2
-from laneweave.protocol.summary import HARD_BRAKE_MPS2, Ending, Planning, RunSummary, Safety
+from laneweave.protocol.summary import (
+    HARD_BRAKE_MPS2,
+    Ending,
+    ObstacleFigures,
+    Planning,
+    RunSummary,
+    Safety,
+)
 
 Row = tuple[str, str]
 """Name of a figure, and its value with unit."""
@@ -60,6 +67,8 @@ def _traffic_rows(summary: RunSummary, *, preferences: bool) -> Iterator[Row]:
         yield "missed exits: vehicles that left elsewhere", f"{vehicles.missed_exits}"
     if vehicles.stopped_at_lane_end:
         yield "stopped at the end of a lane", f"{vehicles.stopped_at_lane_end} vehicles"
+    for one in summary.obstacles or ():
+        yield _obstacle_row(one)
     yield "most vehicles at one time", f"{vehicles.peak}"
     if preferences and summary.preferred_percent is not None:
         share = f"{summary.preferred_percent:.2f} % of {vehicles.left} vehicles"
@@ -72,6 +81,17 @@ def _traffic_rows(summary: RunSummary, *, preferences: bool) -> Iterator[Row]:
         ("travel time, 95th percentile", times.p95, " s"),
         ("travel time, maximum", times.max, " s"),
     )
+
+
+def _obstacle_row(one: ObstacleFigures) -> Row:
+    """Return how long a part of a lane was closed, and what it cost."""
+    what = f"{one.cause} of {one.vehicle}" if one.vehicle else one.cause
+    until = "the end" if one.opened_s is None else f"{one.opened_s:.1f} s"
+    cost = "nobody stopped"
+    if one.stopped:
+        cost = f"{one.stopped} vehicles stopped, {one.waited_s / one.stopped:.0f} s each"
+    place = f"lane {one.lane}, {one.from_m:.0f} to {one.to_m:.0f} m"
+    return f"{what}, {place}", f"{one.since_s:.1f} s to {until}; {cost}"
 
 
 def _safety_rows(safety: Safety) -> Iterator[Row]:

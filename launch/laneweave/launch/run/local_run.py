@@ -20,6 +20,7 @@ import structlog
 from attrs import Factory, define, field
 
 from laneweave.coordinator.planning.kernels import KERNELS
+from laneweave.launch.faults.breakdowns import breakdowns_of
 from laneweave.launch.faults.fault_file import BRIDGE, ROUTER, SENDER_OF_GROUP, FaultSpec
 from laneweave.launch.faults.injection import FaultInjection
 from laneweave.launch.faults.network_namespaces import ENDPOINT, HUB, LISTEN, open_network
@@ -33,7 +34,7 @@ from laneweave.launch.run.role_processes import RoleExit, RoleProcesses, RoleSta
 from laneweave.launch.run.roles import BAD_INPUT, fork_server
 from laneweave.launch.run.run_folder import EVENTS_FILE, LOG_FILE, ROUTER_READY_FILE
 from laneweave.protocol.config.participants import coordinator_names
-from laneweave.protocol.config.scenario_files import to_tables
+from laneweave.protocol.config.scenario_files import parse_scenario, to_tables
 from laneweave.protocol.errors import BadInputError, CommandFailedError, RefusedError
 from laneweave.protocol.runtime.message_faults import SENDER_OF_ROLE
 from laneweave.protocol.runtime.processes import stop_signals
@@ -359,6 +360,7 @@ def fault_injection(
     Raises:
         BadInputError: a partition requires network namespaces, which cannot be created.
     """
+    breakdowns_of(faults, scenario)  # refused before anything is started
     seed = faults.seed_of_run(scenario.seed)
     network, reason = open_network(faults, processes.context, seed)
     endpoint = scenario.network.endpoint
@@ -379,6 +381,8 @@ def add_faults(
 ) -> None:
     """Add the message faults and the network namespace of a role to its tables and options."""
     network, sender = injection.network, SENDER_OF_ROLE.get(start.role)
+    if start.role == BRIDGE:
+        options["breakdowns"] = breakdowns_of(injection.specification, parse_scenario(tables))
     if network is not None and start.role == ROUTER:
         options |= {"namespace": network.process_id(HUB), "listen": (LISTEN,)}
     if sender is None:

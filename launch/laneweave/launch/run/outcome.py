@@ -18,6 +18,7 @@ from laneweave.launch.recordings.runs import scenario_of
 from laneweave.launch.report.summary_table import summary_rows
 from laneweave.launch.run_methods import FORMATION, REFERENCE_METHODS
 from laneweave.protocol.summary import Ending, RunSummary, read_summary, write_summary
+from laneweave.protocol.wire.obstacle_messages import BREAKDOWN
 
 
 @frozen
@@ -72,6 +73,7 @@ def complete_summary(
     failover: Failover | None = None,
     dropped: int = 0,
     faults: dict[str, Any] | None = None,
+    breakdowns: int = 0,
 ) -> Outcome:
     """Complete the summary of a run with the launcher's data, and return the run's outcome.
 
@@ -85,6 +87,7 @@ def complete_summary(
         failover: measured recoveries from leader faults; None: no faults.
         dropped: number of messages dropped by faults.
         faults: record of the injected faults; None: no faults.
+        breakdowns: number of vehicles that were to break down.
 
     Raises:
         KeyboardInterrupt: the run was interrupted before it began.
@@ -118,6 +121,10 @@ def complete_summary(
     # A signal may arrive when the run is already complete.
     interrupted = interrupted and summary.ending == Ending.INTERRUPTED.value
     violations = _violations(summary, interrupted=interrupted or cut_short, of_sumo=of_sumo)
+    happened = sum(one.cause == BREAKDOWN for one in summary.obstacles or ())
+    if happened < breakdowns and not (interrupted or cut_short):
+        text = f"breakdown: only {happened} of {breakdowns} vehicles that fit were on the road"
+        problems = (*problems, text)
     return Outcome(folder, summary, (*problems, *violations), interrupted)
 
 

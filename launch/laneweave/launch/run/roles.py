@@ -323,6 +323,7 @@ def _bridge(_: str, tables: dict[str, Any], options: dict[str, Any]) -> None:
         FORMATION,
         options["pace"],
         _wrap(options),
+        breakdowns=options.get("breakdowns", ()),
     )
 
 

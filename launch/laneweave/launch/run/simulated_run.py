@@ -13,6 +13,7 @@ from attrs import Factory, define, field
 from laneweave.agents.core import AgentCore
 from laneweave.agents.host import AgentHost
 from laneweave.coordinator.core import CoordinatorCore
+from laneweave.launch.faults.breakdowns import breakdowns_of
 from laneweave.launch.faults.fault_file import BRIDGE, ROUTER, FaultSpec
 from laneweave.launch.faults.injection import FaultInjection
 from laneweave.launch.faults.shared_counters import LocalBoard
@@ -148,6 +149,7 @@ class SimulatedRun:
         """
         scenario = self.scenario
         self.faults.check_simulated()
+        breakdowns = breakdowns_of(self.faults, scenario)
         self.folder.mkdir(parents=True, exist_ok=True)
         network = SimulatedNetwork(scenario.seed, self.conditions, skip_codec=True)
         self._roles = SimulatedRoles(network, coordinator_names(scenario), self._start)
@@ -173,6 +175,7 @@ class SimulatedRun:
                 new_incarnation=self._incarnations.__next__,
                 pace=1.0,
                 outside_traffic=road.outside_traffic,
+                breakdowns=breakdowns,
             )
             try:
                 self._drive(network, bridge, progress)

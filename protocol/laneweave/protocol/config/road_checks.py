@@ -9,8 +9,8 @@ import attrs
 
 from laneweave.protocol.config.motion_checks import limit_name
 from laneweave.protocol.config.rules import require
-from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.road_layout import ANY_LANE, END_OF_ROAD, end_exit
+from laneweave.protocol.errors import BadInputError, Described
+from laneweave.protocol.road_layout import ANY_LANE, END_OF_ROAD, LaneSection, end_exit
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.road_tables import (
     MAIN_ENTRANCE,
@@ -21,6 +21,7 @@ from laneweave.protocol.scenario.road_tables import (
 )
 from laneweave.protocol.vehicle.lane_ends import (
     LaneEnd,
+    LaneEnds,
     dead_ends,
     early_start_m,
     exit_lanes,
@@ -28,10 +29,54 @@ from laneweave.protocol.vehicle.lane_ends import (
     lane_beside,
     re_entry,
 )
+from laneweave.protocol.vehicle.sudden_stops import begins_m, room_before_part_m
 from laneweave.protocol.wire.messages import CAR
 
 ROUNDED_SHARE = 1e-3
 """Share of a type that may be due to the rounding of others: it needs no lane."""
+
+
+def check_events(scenario: Scenario) -> None:
+    """Check that parts of lanes that are closed for a time are where these lanes are open."""
+    road = scenario.road
+    for number, event in enumerate(road.events):
+        name = f"road.events[{number}]"
+        allowed = f"a lane from 0 to {road.lanes - 1}"
+        require(event.lane < road.lanes, f"{name}.lane", event.lane, allowed)
+        allowed = f"more than from_m, {event.from_m:g}"
+        require(event.to_m > event.from_m, f"{name}.to_m", event.to_m, allowed)
+        allowed = f"more than at_s, {event.at_s:g}"
+        require(event.until_s > event.at_s, f"{name}.until_s", event.until_s, allowed)
+        sections = [
+            (each, _last_m(scenario, each))
+            for each in scenario.geometry.sections
+            if each.lane == event.lane
+        ]
+        needed_m = room_before_part_m(scenario, re_entry(scenario).room_m)
+        least_m = begins_m(scenario, event.lane, event.from_m) + needed_m
+        places = " or ".join(
+            f"{one.from_m + needed_m:g} to {last_m:g} m" for one, last_m in sections
+        )
+        require(
+            event.from_m >= least_m
+            and any(one.from_m < event.from_m and event.to_m < last_m for one, last_m in sections),
+            f"{name}.from_m",
+            event.from_m,
+            f"a part within {places}, which vehicles that enter the lane can see in time",
+        )
+    require(
+        not (road.events and scenario.sumo.config),
+        "road.events",
+        Described("a table"),
+        "none in a corridor of a SUMO simulation",
+    )
+
+
+def _last_m(scenario: Scenario, section: LaneSection) -> float:
+    """Return up to where a part of a section may be closed suddenly: its stop line, if any."""
+    ends = LaneEnds(scenario)
+    end = None if section.exit else ends.ahead(section.lane, section.from_m)
+    return section.to_m if end is None else end.line_m
 
 
 def check_closures(scenario: Scenario) -> None:

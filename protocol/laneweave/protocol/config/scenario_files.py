@@ -24,6 +24,7 @@ _CHECKS = (
         demand_checks.check_lanes,
         motion_checks.check_motion,
         road_checks.check_closures,
+        road_checks.check_events,
         road_checks.check_entrances,
         road_checks.check_dead_ends,
         road_checks.check_exits,

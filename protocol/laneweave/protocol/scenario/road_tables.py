@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import cached_property
 from typing import Final
 
@@ -25,6 +26,22 @@ class Closure:
         default=LONGEST_ROAD_M, validator=within(0.0, LONGEST_ROAD_M, open_low=True)
     )
     """Where the lane is open again; by default, it is not."""
+
+
+@frozen
+class RoadEvent:
+    """A part of a lane that is closed for a time.
+
+    It is closed as soon as no vehicle is in it, or so near that it could not stop before it.
+    """
+
+    lane: int = field(validator=within(0, 7))
+    from_m: float = field(validator=within(0.0, LONGEST_ROAD_M))
+    to_m: float = field(validator=within(0.0, LONGEST_ROAD_M))
+    at_s: float = field(validator=within(0.0, 1e6))
+    """Road time from which it is closed."""
+    until_s: float = field(default=math.inf, validator=within(0.0, math.inf))
+    """Road time until which it is closed; by default, for ever."""
 
 
 @frozen
@@ -90,6 +107,8 @@ class Road:
     s3_m: float = field(default=600.0, validator=within(0.0, 20_000.0, open_low=True))
     closures: tuple[Closure, ...] = ()
     """Parts of lanes in which no vehicle may drive."""
+    events: tuple[RoadEvent, ...] = ()
+    """Parts of lanes that are closed for a time; vehicles learn of them when they are closed."""
     restrictions: tuple[Restriction, ...] = ()
     """Parts of lanes in which vehicles of some types may not drive."""
     solid_lines: tuple[SolidLine, ...] = ()

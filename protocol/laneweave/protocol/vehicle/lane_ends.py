@@ -23,7 +23,7 @@ from functools import lru_cache, reduce
 from attrs import evolve, frozen
 
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.road_layout import LaneSection
+from laneweave.protocol.road_layout import LaneSection, TemporaryClosure, cut
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.vehicle_tables import Vehicle
 from laneweave.protocol.vehicle.emergency_brake import (
@@ -62,6 +62,12 @@ TAKEN_BACK_M = 1.0
 TRACKING_SHARE = 0.9
 """Share of the time before a body touches the other lane by which a move may begin early; the rest
 is kept for tracking errors."""
+HEEDED_BRAKING_MPS2 = 8.0
+"""Deceleration with which a vehicle that brakes for such a part must still be able to stop."""
+NEAR_LINE_M = 1.0
+"""Distance past a line at which a vehicle still stands at it."""
+CLEAR_M = 1.0
+"""Distance from a closed part at which a vehicle stops for which the line came too late."""
 ROUNDING_M = 1e-6
 """Tolerance for comparing positions."""
 
@@ -86,6 +92,8 @@ class LaneEnd:
     """Where moves may begin in the section; -inf: everywhere."""
     taken_back: bool = False
     """Whether SUMO takes back vehicles that do not change lanes; there is no re-entry."""
+    sudden: bool = False
+    """Whether it is the beginning of a part that is closed for a time."""
 
 
 @frozen
@@ -111,12 +119,14 @@ class ReEntry:
 class LaneEnds:
     """The ends of lanes before the end of a scenario's road: dead ends and exits."""
 
-    def __init__(self, scenario: Scenario) -> None:
-        """Derive the stop lines."""
+    def __init__(self, scenario: Scenario, closed: Sequence[TemporaryClosure] = ()) -> None:
+        """Derive the stop lines, also those before parts that are `closed` for a time."""
         self._lattice = scenario.lattice
         lanes = range(scenario.road.lanes)
-        self._dead_ends = _by_lane(dead_ends(scenario), lanes)
-        self._exits = _by_lane(exit_lanes(scenario), lanes)
+        self._dead_ends = _by_lane(dead_ends(scenario, closed), lanes)
+        self._exits = _by_lane(exit_lanes(scenario, closed), lanes)
+        self._late = {end: evolve(end, stop_m=end.end_m - CLEAR_M) for end in self if end.sudden}
+        """Dead ends for vehicles that cannot stop at the line."""
         self._touching_s = (1.0 - BEFORE_TOUCHING) * scenario.timing.move_s
         early_m = 0.0 if scenario.formation.change_columns else early_start_m(scenario)
         self._begins_m = [
@@ -128,7 +138,7 @@ class LaneEnds:
                     section.from_m,
                     section.to_m,
                 )
-                for section in scenario.geometry.sections
+                for section in cut(scenario.geometry.sections, closed)
                 if section.lane == lane
             ]
             for lane in lanes
@@ -174,6 +184,20 @@ class LaneEnds:
         """
         s_m = self._lattice.cell_s_m(cell[0], t_s)
         return max([s_m, *self._begun_m(cell[1], s_m)])
+
+    def heeded(self, lane: int, s_m: float, speed_mps: float) -> LaneEnd | None:
+        """Return the dead end ahead of a vehicle, with the position at which it stops.
+
+        If a lane is closed suddenly, this may be beyond the line. None: it cannot stop before the
+        closed part either, so it drives on, and stops behind what it senses.
+        """
+        end = self.ahead(lane, s_m)
+        if end is None or not end.sudden:
+            return end
+        stops_m = s_m + max(speed_mps, 0.0) ** 2 / (2.0 * HEEDED_BRAKING_MPS2)
+        if stops_m <= end.stop_m + NEAR_LINE_M:
+            return end
+        return self._late[end] if stops_m <= end.end_m else None
 
     def ahead(self, lane: int, s_m: float) -> LaneEnd | None:
         """Return the dead end of the section in which a position is, or which it has passed."""
@@ -231,6 +255,13 @@ class LaneEnds:
                     return True
         return False
 
+    def reaches_line(self, origin: Cell, target: Cell, t_s: float, takes_s: float) -> bool:
+        """Return whether a dead end of one of its lanes is too near for a move of a duration."""
+        front, lanes = max(origin[0], target[0]), {origin[1], target[1]}
+        body_m = {lane: self.in_section_m((origin[0], lane), t_s) for lane in lanes}
+        end_s = t_s + takes_s - LATE_S
+        return any(self.has_passed((front, lane), end_s, body_m[lane]) for lane in lanes)
+
     def _ends_changes(self, cell: Cell, t_s: float, body_m: float) -> bool:
         """Return whether a cell is where lane changes have ended before the exit of a section."""
         return self._is_beyond(self.exit_ahead(cell[1], body_m), cell, t_s)
@@ -240,23 +271,36 @@ class LaneEnds:
         return end is not None and self._lattice.cell_s_m(cell[0], t_s) > end.line_m
 
 
-def dead_ends(scenario: Scenario) -> tuple[LaneEnd, ...]:
-    """Return the dead ends of a road in order of lane, then of position."""
-    return tuple(end for section, end in _ends(scenario) if not section.exit)
+def dead_ends(scenario: Scenario, closed: Sequence[TemporaryClosure] = ()) -> tuple[LaneEnd, ...]:
+    """Return the dead ends of a road in order of lane, then of position; see `LaneEnds`."""
+    return _in_order(end for section, end in _ends(scenario, closed) if not section.exit)
 
 
-def exit_lanes(scenario: Scenario) -> tuple[LaneEnd, ...]:
+def exit_lanes(scenario: Scenario, closed: Sequence[TemporaryClosure] = ()) -> tuple[LaneEnd, ...]:
     """Return the lanes of exits before the end of a road in order of lane, then of position."""
-    return tuple(end for section, end in _ends(scenario) if section.exit)
+    return _in_order(end for section, end in _ends(scenario, closed) if section.exit)
 
 
-def _ends(scenario: Scenario) -> Iterator[tuple[LaneSection, LaneEnd]]:
+def _in_order(ends: Iterable[LaneEnd]) -> tuple[LaneEnd, ...]:
+    return tuple(sorted(ends, key=lambda end: (end.lane, end.end_m)))
+
+
+def _ends(
+    scenario: Scenario, closed: Sequence[TemporaryClosure] = ()
+) -> Iterator[tuple[LaneSection, LaneEnd]]:
     """Yield the sections that end before the road, and their ends."""
-    sections = scenario.geometry.sections
+    always = len(scenario.geometry.sections)
+    sections = cut(scenario.geometry.sections, closed)
+    late_m = {(one.lane, one.from_m): one.late_m for one in closed}
     for number, section in enumerate(sections):
         if not section.exit or section.to_m < scenario.road.length_m:
-            later = [each.from_m for each in sections[number + 1 :] if each.lane == section.lane]
+            later = [
+                each.from_m
+                for each in sections
+                if each.lane == section.lane and each.from_m >= section.to_m
+            ]
             line_m = section.to_m - re_entry(scenario).room_m
+            line_m -= late_m.get((section.lane, section.to_m), 0.0)
             stop_m = section.to_m if section.exit else line_m
             taken_back = bool(scenario.sumo.config) and line_m < first_step_m(
                 scenario, max(section.from_m, section.moves_from_m)
@@ -275,6 +319,7 @@ def _ends(scenario: Scenario) -> Iterator[tuple[LaneSection, LaneEnd]]:
                     reopens_m=min(later, default=math.inf),
                     moves_from_m=section.moves_from_m,
                     taken_back=taken_back,
+                    sudden=number >= always,
                 ),
             )
 
@@ -319,7 +364,9 @@ def _end_ahead(by_lane: Sequence[Sequence[LaneEnd]], lane: int, s_m: float) -> L
     return None
 
 
-def lane_beside(scenario: Scenario, end: LaneEnd) -> int | None:
+def lane_beside(
+    scenario: Scenario, end: LaneEnd, closed: Sequence[TemporaryClosure] = ()
+) -> int | None:
     """Return the lane into which vehicles re-enter at a dead end; None: there is none.
 
     It is open from before the stop line until a vehicle that re-enters has arrived in its cell, and
@@ -327,7 +374,7 @@ def lane_beside(scenario: Scenario, end: LaneEnd) -> int | None:
     """
     needed = re_entry(scenario)
     pitch_m = scenario.lattice.pitch_m
-    sections = sections_to_lines(scenario)
+    sections = sections_to_lines(scenario, closed)
     from_m = end.line_m - needed.columns * pitch_m - scenario.types.longest_body_m
     to_m = min(end.line_m + needed.distance_m, scenario.road.length_m)
     entry_m = dict(enumerate(scenario.geometry.entry_m))
@@ -341,12 +388,14 @@ def lane_beside(scenario: Scenario, end: LaneEnd) -> int | None:
     return None
 
 
-def sections_to_lines(scenario: Scenario) -> tuple[LaneSection, ...]:
+def sections_to_lines(
+    scenario: Scenario, closed: Sequence[TemporaryClosure] = ()
+) -> tuple[LaneSection, ...]:
     """Return the sections of a road as far as plans may use them, up to the lines before ends."""
-    lines_m = {section: end.line_m for section, end in _ends(scenario)}
+    lines_m = {section: end.line_m for section, end in _ends(scenario, closed)}
     return tuple(
         evolve(section, to_m=lines_m.get(section, section.to_m))
-        for section in scenario.geometry.sections
+        for section in cut(scenario.geometry.sections, closed)
     )
 
 

@@ -270,6 +270,13 @@ def hold_law(state: State, reference: State, limits: Vehicle, tick_s: float) -> 
     return limited_jerk(state, jerk, limits, tick_s)
 
 
+def stop_law(state: State, goal: State, decel_mps2: float, limits: Vehicle, tick_s: float) -> Jerk:
+    """Return the jerk that brakes to standing with a deceleration, beside a goal state."""
+    _, across = hold_law(state, (state[0], *goal[1:]), limits, tick_s)
+    wanted_mps2 = max(-decel_mps2, -max(state[1], 0.0) / tick_s)
+    return limited_jerk(state, ((wanted_mps2 - state[2]) / tick_s, across), limits, tick_s)
+
+
 def keep_gap(
     state: State,
     jerk: Jerk,

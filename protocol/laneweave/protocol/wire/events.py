@@ -55,6 +55,10 @@ DRIVES_OUT: Final = "drives-out"
 """Bridge: a vehicle starts from the end of its lane into a gap in the neighbouring lane."""
 ENTERED_LATTICE: Final = "entered-lattice"
 """Bridge: a vehicle that had stopped before the end of its lane has a cell again."""
+PART_CLOSED: Final = "part-closed"
+"""Bridge: a part of a lane is closed for a time, or ends elsewhere than was known before."""
+PART_OPENED: Final = "part-opened"
+"""Bridge: a part of a lane that was closed for a time is open again."""
 AGENT_MISSING: Final = "agent-missing"
 """Bridge: the agent of a vehicle did not start in time."""
 AGENT_SILENT: Final = "agent-silent"
@@ -112,6 +116,8 @@ FIELDS: Final[Mapping[str, tuple[str, ...]]] = {
     MISSED_EXIT: ("vehicle", "lane"),
     DRIVES_OUT: ("vehicle", "lane"),
     ENTERED_LATTICE: ("vehicle", "lane"),
+    PART_CLOSED: ("lane", "from_m", "to_m", "late_m", "cause", "vehicle", "since_s", "until_s"),
+    PART_OPENED: ("lane", "from_m", "to_m", "late_m", "cause", "vehicle", "since_s", "until_s"),
     AGENT_MISSING: ("vehicle",),
     AGENT_SILENT: ("vehicle",),
     CARETAKER_TOOK_OVER: ("vehicle", "reason"),
@@ -160,6 +166,11 @@ MEANINGS: Final[Mapping[str, str]] = {
     "columns": "rearmost and foremost column of the formation",
     "vehicle": "name of the vehicle",
     "lane": "lane; 0 is the rightmost",
+    "from_m": "beginning of the closed part [m]",
+    "to_m": "end of the closed part [m]",
+    "late_m": "length of the queue of vehicles that cannot stop at the stop line [m]",
+    "cause": "breakdown or closed",
+    "until_s": "road time at which the cause ends [s]; null: not known",
     "preferred_lane": "lane in which the vehicle wants to leave; -1: any",
     "destination": "name of the exit by which the vehicle wants to leave; end: end of the road",
     "exit": "name of the exit by which the vehicle left; end: end of the road",
@@ -172,7 +183,7 @@ MEANINGS: Final[Mapping[str, str]] = {
     "unanswered": "names of the vehicles that did not answer in time",
     "out_of_reach": "names of the vehicles that `missed` counts for the first time",
     "phase": "preparing: promises are missing; issuing: acceptances of the plan",
-    "since_s": "road time since which the sender leads [s]",
+    "since_s": "road time since which the sender leads, or the part is closed [s]",
     "unattended_since_s": "road time since which no agent was in charge [s]; null: one was",
     "leader_until_s": "road time of the last heartbeat of a leader before [s]; null: none",
     "occupant": "vehicle, or gap for one, that occupies a cell on the way",

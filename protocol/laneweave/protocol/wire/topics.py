@@ -18,7 +18,7 @@ from attrs import frozen
 
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.names import NAME_PATTERN, NAME_RULE
-from laneweave.protocol.wire import messages, process_messages
+from laneweave.protocol.wire import messages, obstacle_messages, process_messages
 from laneweave.protocol.wire.field_types import Message
 
 PREFIX = "laneweave"
@@ -126,6 +126,10 @@ CENSUS = Topic(
     "census", "census", messages.Census, Party.BRIDGE, Quality.LATEST,
     readers=(Party.COORDINATOR, Party.FLEET, Party.OBSERVER), long=True,
     remark="fleets: only those with a shard",
+)  # fmt: skip
+OBSTACLES = Topic(
+    "obstacles", "obstacles", obstacle_messages.Obstacles, Party.BRIDGE, Quality.LATEST,
+    readers=(Party.COORDINATOR, Party.VEHICLE, Party.FLEET, Party.OBSERVER),
 )  # fmt: skip
 SENSE = Topic(
     "sense", "sense/{vehicle}", messages.Sense, Party.BRIDGE, Quality.LOCKSTEP,

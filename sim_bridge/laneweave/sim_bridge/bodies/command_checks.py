@@ -32,6 +32,10 @@ MAX_MOTION_TICKS = 6000
 """Maximum duration of a motion; the longest are those of vehicles that settle in their cells."""
 ERRORS_M = 1.0
 """Spare distance that may be missing because of measurement errors."""
+STOPPING_MPS = 3.0
+"""Speed below v_F from which a body is about to stop."""
+STOPPING_MPS2 = -3.0
+"""The same for its acceleration; moves need less."""
 CATCHING_UP_MPS = 1.0
 """Speed above v_F from which a body that keeps its column catches up with its cell."""
 
@@ -74,20 +78,25 @@ class LaneGaps:
         self._keeps_columns = not scenario.formation.change_columns
         self._speed_mps = scenario.lattice.speed_mps
         self._touching_s = BEFORE_ENTERING * scenario.timing.move_s
+        self._leaving_s = scenario.timing.move_s - self._touching_s
+        self._min_gap_m = scenario.tracking.min_gap_m
         weakest = scenario.types.weakest_braking
         self._weakest_brake = EmergencyBrake(weakest, scenario.braking, scenario.runtime.tick_s)
 
-    def allow(self, lane: int, neighbours: Sides, speed_mps: float) -> bool:
+    def allow(self, own_lane: int, lane: int, neighbours: Sides, speed_mps: float) -> bool:
         """Return whether a lane change may begin: no body is in the way, and none will be.
 
         Args:
+            own_lane: the lane of the body.
             lane: the other lane.
             neighbours: measured neighbours ahead and behind.
             speed_mps: speed of this vehicle.
         """
-        _, behind = neighbours
-        return not self.blocked(lane, neighbours, speed_mps) and not any(
-            one.lane == lane and self._cuts_in(one, speed_mps) for one in behind
+        ahead, behind = neighbours
+        return not (
+            self.blocked(lane, neighbours, speed_mps)
+            or any(one.lane == lane and self._cuts_in(one, speed_mps) for one in behind)
+            or any(one.lane == own_lane and self._holds_up(one, speed_mps) for one in ahead)
         )
 
     def blocked(self, lane: int, neighbours: Sides, speed_mps: float) -> bool:
@@ -101,6 +110,19 @@ class LaneGaps:
             one.lane == lane and self._spare_m(one, speed_mps, one.gap_m) < -ERRORS_M
             for one in behind
         )
+
+    def _holds_up(self, ahead: Neighbour, speed_mps: float) -> bool:
+        """Return whether one that stops ahead would stop this vehicle before it has left the lane.
+
+        It would then stand in both lanes, and nobody could pass it.
+        """
+        if ahead.speed_mps > self._speed_mps - STOPPING_MPS and ahead.accel_mps2 > STOPPING_MPS2:
+            return False
+        drives_s = self._leaving_s
+        if ahead.accel_mps2 < 0.0:
+            drives_s = min(drives_s, -ahead.speed_mps / ahead.accel_mps2)
+        drives_m = ahead.speed_mps * drives_s + 0.5 * min(ahead.accel_mps2, 0.0) * drives_s**2
+        return ahead.gap_m + drives_m - speed_mps * self._leaving_s < self._min_gap_m
 
     def _cuts_in(self, behind: Neighbour, speed_mps: float) -> bool:
         """Return whether one that catches up in the other lane could not brake for this vehicle.

@@ -33,7 +33,6 @@ from laneweave.protocol.lattice import Cell, Lattice, footprint
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.vehicle_tables import Vehicle
 from laneweave.protocol.vehicle.emergency_brake import EmergencyBrake
-from laneweave.protocol.vehicle.lane_ends import LaneEnds
 from laneweave.protocol.vehicle.motion import (
     ARRIVED_ACROSS_M,
     DISPLACED_ALONG_M,
@@ -48,6 +47,7 @@ from laneweave.protocol.vehicle.motion import (
     hold_law,
     keep_gap,
     limited_accel,
+    stop_law,
 )
 from laneweave.protocol.vehicle.territory import territory_of
 from laneweave.protocol.wire.messages import (
@@ -120,6 +120,10 @@ class MotionController:
     """Measured neighbours."""
     off_lattice: OffLatticePhase | None = None
     """None: the vehicle has cells."""
+    broken_mps2: float | None = None
+    """Deceleration with which a broken-down vehicle stops and stands; None: it drives."""
+    stays: bool = False
+    """Whether it waits where it stands, not at a stop line."""
     _measured: State | None = None
     _jerks: array[float] = field(init=False)
     """Pairs (along, across) for successive ticks [m/s3]."""
@@ -129,8 +133,7 @@ class MotionController:
     tick_s: float = field(init=False)
     _brake: EmergencyBrake = field(init=False)
     _lane_gaps: LaneGaps = field(init=False)
-    _lane_ends: LaneEnds = field(init=False)
-    _stop_lines: StopLinesAhead = field(init=False)
+    stop_lines: StopLinesAhead = field(init=False)
     _guard: CellGuard = field(init=False)
 
     def __attrs_post_init__(self) -> None:
@@ -145,8 +148,7 @@ class MotionController:
         self._jerks = array("f")
         self._brake = EmergencyBrake(self._limits, self._scenario.braking, self.tick_s)
         self._lane_gaps = LaneGaps(self._scenario)
-        self._lane_ends = LaneEnds(self._scenario)
-        self._stop_lines = StopLinesAhead(self._lane_ends, self._limits, self.lattice)
+        self.stop_lines = StopLinesAhead(self._scenario, self._limits)
         self._guard = CellGuard(self._scenario, self._limits)
 
     @property
@@ -191,9 +193,9 @@ class MotionController:
         out of another lane may come to a line, too, if it could not settle before. A body that
         drives partly in another lane keeps its cell if others would be led into it.
         """
-        if self.off_lattice is OffLatticePhase.WAITING or not self._lane_ends:
+        if self.off_lattice is OffLatticePhase.WAITING or not self.stop_lines.lane_ends:
             return False
-        if self.off_lattice is OffLatticePhase.RE_ENTERING and self._stop_lines.passed:
+        if self.off_lattice is OffLatticePhase.RE_ENTERING and self.stop_lines.passed:
             return False
         stays_free = self.store.territory.given_up_cells_stay_free
         first, last = self.lattice.lanes_touched(self.measured[3], self._limits.width_m)
@@ -201,7 +203,8 @@ class MotionController:
             return False
         # Behind an exit the lane may belong to a ramp, to whose end the body does not come.
         cell = self.hold_cell[0], self._body_lane
-        return self._lane_ends.has_passed(cell, t_s, body_m=self.measured[0])
+        body_m = self.stop_lines.section_m(cell[1], self.measured[0])
+        return self.stop_lines.lane_ends.has_passed(cell, t_s, body_m=body_m)
 
     @property
     def keeps_lane(self) -> bool:
@@ -219,7 +222,7 @@ class MotionController:
 
     def _misses_exit(self, goal: Cell, t_s: float) -> bool:
         """Return whether it is too late to begin to leave the lane of the body for a cell."""
-        ends, lane = self._lane_ends, self._body_lane_for(goal[1])
+        ends, lane = self.stop_lines.lane_ends, self._body_lane_for(goal[1])
         return lane != goal[1] and ends.too_late((goal[0], lane), goal, t_s)
 
     def return_to_origin(self, t_s: float) -> bool:
@@ -257,9 +260,10 @@ class MotionController:
         self._stop_motion()
 
     def re_enter(self, cell: Cell) -> None:
-        """Start from standing towards a cell of the neighbouring lane, which is kept free."""
+        """Start from standing towards a cell that is kept free, of this or a neighbouring lane."""
         self.off_lattice, self.hold_cell = OffLatticePhase.RE_ENTERING, cell
-        self._stop_lines.passed = True
+        self.broken_mps2, self.stays = None, False
+        self.stop_lines.start(cell[1], self._body_lane, self.measured[0])
         self._stop_motion()
 
     def enter_lattice(self, cells: Iterable[Cell]) -> None:
@@ -320,9 +324,9 @@ class MotionController:
         lane = command.hold_cell[1]
         if lane != self.hold_cell[1] and (
             self.level is FallbackLevel.EMERGENCY
-            or not self._lane_gaps.allow(lane, self.neighbours, self.measured[1])
+            or not self._lane_gaps.allow(self.hold_cell[1], lane, self.neighbours, self.measured[1])
             or self._misses_exit(command.hold_cell, t_s)
-            or not self._lane_is_open(command.hold_cell, t_s)
+            or not self.stop_lines.allow(command, t_s)
         ):
             return False
         if len(jerks) > 0 or leaves:
@@ -347,13 +351,6 @@ class MotionController:
             if occupant is not None:
                 return Refusal(Problem.OCCUPIED, occupant=occupant)
         return None
-
-    def _lane_is_open(self, target: Cell, t_s: float) -> bool:
-        """Return whether a move may lead into the lane of a cell here."""
-        ends = self._lane_ends
-        if not ends:
-            return True
-        return ends.may_begin(self.hold_cell, target, t_s) and not ends.has_passed(target, t_s)
 
     def store_requests(self, command: Command) -> bool:
         """Store the record of a command for any tick; return whether anything has changed.
@@ -388,8 +385,8 @@ class MotionController:
         if near:
             near = self._relevant(near, measured[3])
         stays = self._must_stay_in_lane(tick)
-        if self._lane_ends:
-            t_s, seen = tick * self.tick_s, self._stop_lines
+        if self.stop_lines.lane_ends and self.broken_mps2 is None:
+            t_s, seen = tick * self.tick_s, self.stop_lines
             near = [*near, *seen.lines(measured, self.hold_cell, t_s, enters=not stays)]
         level, jerk = self._next(tick, near, stays=stays)
         if near and self._must_brake(measured, jerk, near):
@@ -436,6 +433,10 @@ class MotionController:
         goal = cell_state(self.lattice, self.hold_cell, tick * self.tick_s)
         if self.off_lattice is OffLatticePhase.WAITING:
             goal = (state[0], *goal[1:])  # at v_F in its lane, up to the line
+            stands = self.stays and body[1] < STANDING_MPS
+            brake_mps2 = -limits.min_accel_mps2 if stands else self.broken_mps2
+            if brake_mps2 is not None:
+                return FallbackLevel.HOLD, stop_law(state, goal, brake_mps2, limits, self.tick_s)
         elif stays:
             goal = (*goal[:3], self.lattice.cell_y_m(self._body_lane), 0.0, 0.0)
         jerk = hold_law(state, goal, limits, self.tick_s)
@@ -447,7 +448,7 @@ class MotionController:
             )
             for other in near
             # A vehicle that starts into another lane brakes for the end of its own only if it must.
-            if not self._stop_lines.passed or other.lane == goal_lane
+            if not self.stop_lines.passed or other.lane == goal_lane
         ]
         min_gap_m = self._scenario.tracking.min_gap_m
         careful = keep_gap(state, jerk, ahead, limits, min_gap_m, self.tick_s)
@@ -467,7 +468,7 @@ class MotionController:
         s_m, speed_mps = self.measured[:2]
         columns = self.motion.origin[0], self.hold_cell[0]
         t_s = tick * self.tick_s
-        if self._lane_ends.has_passed(self.hold_cell, t_s):
+        if self.stop_lines.lane_ends.has_passed(self.hold_cell, t_s):
             return True  # the other lane has ended meanwhile
         if self.has_missed_exit(t_s):
             return True

@@ -20,7 +20,9 @@ from typing import NamedTuple
 
 from attrs import frozen
 
+from laneweave.protocol.road_layout import TemporaryClosure
 from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.road_tables import Closure
 from laneweave.protocol.wire.messages import Neighbour
 
 Pose = tuple[float, float, float, float]
@@ -165,20 +167,24 @@ class Bodies:
                     pairs.append((min(name, other_name), max(name, other_name)))
         return sorted(pairs)
 
-    def in_closed_lanes(self, scenario: Scenario) -> list[tuple[str, str]]:
+    def in_closed_lanes(
+        self, scenario: Scenario, closed: Iterable[TemporaryClosure] = ()
+    ) -> list[tuple[str, str]]:
         """Return (name of a closed part, vehicle) for each body that reaches into it.
 
         A closed part counts as a body of its lane's width; rotated bodies as their bounding boxes.
+        `closed`: parts that are closed for a time.
         """
         pairs = []
         lane_m = scenario.road.lane_width_m
         tick_m = scenario.vehicle.max_speed_mps * scenario.runtime.tick_s
         closures = scenario.geometry.closed_to_bodies(scenario.types.longest_body_m, tick_m)
-        for number, closed in enumerate(closures):
-            low_m = closed.lane * lane_m + _TOUCH_M
+        parts: list[Closure | TemporaryClosure] = [*closures, *closed]
+        for number, part in enumerate(parts):
+            low_m = part.lane * lane_m + _TOUCH_M
             high_m = low_m + lane_m - 2.0 * _TOUCH_M
             for name, (rear, front, low, high) in zip(self._names, self._extents, strict=True):
-                along = rear < closed.to_m - _TOUCH_M and front > closed.from_m + _TOUCH_M
+                along = rear < part.to_m - _TOUCH_M and front > part.from_m + _TOUCH_M
                 if along and low < high_m and high > low_m:
                     pairs.append((f"closure-{number}", name))
         return pairs

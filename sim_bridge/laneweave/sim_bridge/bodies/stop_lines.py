@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from attrs import define
+from attrs import Factory, define
 
-from laneweave.protocol.lattice import Cell, Lattice
+from laneweave.protocol.lattice import Cell
+from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.vehicle_tables import Vehicle
-from laneweave.protocol.vehicle.lane_ends import LaneEnds
+from laneweave.protocol.vehicle.lane_ends import NEAR_LINE_M, LaneEnd, LaneEnds
 from laneweave.protocol.vehicle.motion import State
-from laneweave.protocol.wire.messages import Neighbour
+from laneweave.protocol.wire.messages import Command, Neighbour
 
 MAX_LINE_GAP_M = 200.0
 """Distance from which stop lines are seen; more than any stopping distance."""
@@ -20,11 +21,33 @@ STANDING_MPS = 0.3
 class StopLinesAhead:
     """The stop lines ahead of one vehicle."""
 
-    _lane_ends: LaneEnds
+    _scenario: Scenario
     _limits: Vehicle
-    _lattice: Lattice
+    lane_ends: LaneEnds = Factory(lambda self: LaneEnds(self._scenario), takes_self=True)
     passed: bool = False
-    """Whether the vehicle has started from standing at a stop line, into another lane."""
+    """Whether the vehicle has started from standing at a stop line."""
+    _past: LaneEnd | None = None
+    """Beginning of a part of its lane that is open again: it has started there, and passes it."""
+
+    def start(self, goal: int, lane: int, s_m: float) -> None:
+        """Start from standing towards a lane, from a position in another or the same one."""
+        end = self.lane_ends.ahead(lane, s_m)
+        self.passed = True
+        if end is not None and end.sudden and (goal == lane or s_m > end.line_m + NEAR_LINE_M):
+            self._past = end
+
+    def section_m(self, lane: int, s_m: float) -> float:
+        """Return a position in the section of a lane whose end counts for a body there."""
+        past = self._past
+        return s_m if past is None or past.lane != lane else max(s_m, past.reopens_m)
+
+    def allow(self, command: Command, t_s: float) -> bool:
+        """Return whether a move may begin in both its lanes, and ends before one of them does."""
+        ends, move = self.lane_ends, (command.motion.origin, command.hold_cell)
+        takes_s = command.motion.end_tick * self._scenario.runtime.tick_s - t_s
+        return not ends or (
+            ends.may_begin(*move, t_s) and not ends.reaches_line(*move, t_s, takes_s)
+        )
 
     def lines(
         self, measured: State, hold_cell: Cell, t_s: float, *, enters: bool
@@ -41,15 +64,19 @@ class StopLinesAhead:
             enters: whether the body may enter the lane of this cell.
         """
         s_m, speed_mps, goal = measured[0], measured[1], hold_cell[1]
-        first, last = self._lattice.lanes_touched(measured[3], self._limits.width_m)
-        in_lane_m = dict.fromkeys(range(first, last + 1), s_m)
+        first, last = self._scenario.lattice.lanes_touched(measured[3], self._limits.width_m)
+        if self._past is not None and not (
+            first <= self._past.lane <= last and s_m < self._past.reopens_m
+        ):
+            self._past = None
+        in_lane_m = {lane: self.section_m(lane, s_m) for lane in range(first, last + 1)}
         if goal not in in_lane_m and enters:
             # The lane may open ahead, behind the end of another section.
-            in_lane_m[goal] = self._lane_ends.in_section_m(hold_cell, t_s)
+            in_lane_m[goal] = self.lane_ends.in_section_m(hold_cell, t_s)
         ends = [
             end
             for lane, at_m in in_lane_m.items()
-            if (end := self._lane_ends.ahead(lane, at_m)) is not None
+            if (end := self.lane_ends.heeded(lane, at_m, speed_mps)) is not None
         ]
         if all(end.lane == goal for end in ends):
             self.passed = False
@@ -61,6 +88,6 @@ class StopLinesAhead:
         ]
         if first != last:
             # Where an exit lane parts from the road, a body must not be in both.
-            exits = [self._lane_ends.exit_ahead(lane, s_m) for lane in (first, last)]
+            exits = [self.lane_ends.exit_ahead(lane, s_m) for lane in (first, last)]
             lines += [(each.lane, each.stop_m - s_m) for each in exits if each is not None]
         return [Neighbour(lane, gap_m, 0.0) for lane, gap_m in lines if gap_m < MAX_LINE_GAP_M]

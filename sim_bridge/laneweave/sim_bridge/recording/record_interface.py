@@ -7,6 +7,7 @@ from typing import Protocol
 
 from laneweave.protocol.summary import Ending
 from laneweave.protocol.wire.messages import ClosedFormation, Heartbeat, Name
+from laneweave.protocol.wire.obstacle_messages import Obstacle
 from laneweave.protocol.wire.process_messages import LogEvent, Report
 from laneweave.sim_bridge.bodies.command_checks import Refusal
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import MinGaps
@@ -34,6 +35,9 @@ class RoadRecord(Protocol):
 
     def on_lane_end(self, t_s: float, vehicle: Name, lane: int, kind: str) -> None:
         """Record that a vehicle has left the lattice at a dead end, or comes back."""
+
+    def on_obstacle(self, t_s: float, kind: str, obstacle: Obstacle) -> None:
+        """Record that a part of a lane is closed for a time, or open again."""
 
     def on_refused(self, t_s: float, vehicle: Name, refusal: Refusal) -> None:
         """Record that a motion controller has refused a command that no correct agent sends."""

@@ -28,6 +28,7 @@ from typing import Protocol
 
 import pyarrow as pa
 from attrs import define, evolve, field
+from msgspec import structs
 
 from laneweave.protocol.errors import CommandFailedError
 from laneweave.protocol.lattice import Cell
@@ -59,6 +60,7 @@ from laneweave.protocol.wire.events import (
     RUN_ENDED,
 )
 from laneweave.protocol.wire.messages import ClosedFormation, Heartbeat, Name
+from laneweave.protocol.wire.obstacle_messages import Obstacle
 from laneweave.protocol.wire.process_messages import LogEvent, Report
 from laneweave.sim_bridge.bodies.command_checks import Refusal
 from laneweave.sim_bridge.bodies.motion_controller import FallbackLevel
@@ -67,6 +69,7 @@ from laneweave.sim_bridge.recording.disk import Disk
 from laneweave.sim_bridge.recording.events import Events
 from laneweave.sim_bridge.recording.leadership import Leadership
 from laneweave.sim_bridge.recording.missed_lanes import MissedLanes, leaderless_after_s
+from laneweave.sim_bridge.recording.obstacle_log import ObstacleLog
 from laneweave.sim_bridge.recording.reports import ReportTotals
 from laneweave.sim_bridge.recording.ticks import Ticks
 from laneweave.sim_bridge.recording.trajectories import Sample, Trajectories
@@ -184,6 +187,7 @@ class RunRecord:
         self._level_ticks: Counter[FallbackLevel] = Counter()
         self._counts = _Counts()
         self._left_out = left_out
+        self._obstacles = ObstacleLog()
         self._refused_s = dict[tuple[Name, str], float]()
         """Time of the last event for a refused command, by vehicle and reason."""
         self._exits = Exits(scenario.geometry.sections, scenario.road.length_m)
@@ -300,9 +304,15 @@ class RunRecord:
     def on_lane_end(self, t_s: float, vehicle: Name, lane: int, kind: str) -> None:
         """Record that a vehicle has left the lattice at a dead end, or comes back; see `events`."""
         self._missed_lanes.on_lane_end(vehicle, kind)
+        self._obstacles.on_lane_end(t_s, vehicle, lane, kind)
         if kind == LEFT_LATTICE:
             self._counts.stopped.add(vehicle)
         self.event(t_s, kind, vehicle=vehicle, lane=lane)
+
+    def on_obstacle(self, t_s: float, kind: str, obstacle: Obstacle) -> None:
+        """Record that a part of a lane is closed for a time, or open again; see `events`."""
+        self._obstacles.on_obstacle(t_s, kind, obstacle)
+        self.event(t_s, kind, **structs.asdict(obstacle))
 
     def on_refused(self, t_s: float, vehicle: Name, refusal: Refusal) -> None:
         """Count a refused command; write an event if there was none for a while."""
@@ -441,6 +451,7 @@ class RunRecord:
             throughput_veh_per_lane_h=throughput(trips, scenario.road.lanes),
             safety=evolve(self._trajectories.safety(), commands_refused=self._counts.refused),
             ending=ending.value,
+            obstacles=self._obstacles.figures,
             recorded_until_s=None if self._disk.works else round(self._recorded_s, 6),
             planning=self._events.planning(),
             tracking=self._tracking(),

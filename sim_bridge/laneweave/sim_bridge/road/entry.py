@@ -21,6 +21,9 @@ such a lane are not assigned to vehicles near them before the last ramp: each ve
 an exit before gets the cells of its column in the lanes of the exit, unless they have an owner, and
 once it has left, a ramp can use them.
 
+While parts of lanes are closed for a time, each column gets only as many vehicles from the start of
+the road as lanes are open beside the part. Vehicles then pass it without changing columns.
+
 Decisions do not depend on later arrivals: they are made in order of time and, at equal times, of
 the numbers of entry points.
 """
@@ -133,6 +136,11 @@ class EntryMeter:
         self._names: set[str] = set()
         self._columns = [int(s_m // lattice.pitch_m) for s_m in self._entry_m]
         """Next column that vehicles can enter at each entry point."""
+        self.most_in_column: int | None = None
+        """Maximum number of vehicles of a column that enter at the start of the road, counting the
+        lanes kept free; None: any number."""
+        self._in_column: dict[int, int] = {}
+        """This number by column, as long as vehicles may enter there."""
         self._until_s = -math.inf
         """Time after which the next vehicles enter."""
         self._free_s = [-math.inf] * len(points)
@@ -162,7 +170,11 @@ class EntryMeter:
         if self._builder is not None:
             return self._builder.reserve(first, count, t_s)
         self._columns[point] = first - count
-        return range(first - count + 1, first + 1)
+        kept = range(first - count + 1, first + 1)
+        if self._entry_m[point] <= 0.0:
+            for column in kept:
+                self._count_in(column)
+        return kept
 
     def points_kept_free(self, point: int) -> Collection[int]:
         """Return the entry points at which `keep_free` keeps columns free: with formations, all."""
@@ -196,14 +208,16 @@ class EntryMeter:
         point = arrival.entry_point
         if column > self._columns[point] or not self.is_possible(arrival, column):
             return False
-        if arrival.vehicle_type in self._column_bound:
-            self._keep_column(column, arrival)
+        self._enter(arrival, column)
         self._columns[point] = column - 1
         return True
 
     def is_possible(self, arrival: Arrival, column: int) -> bool:
         """Return whether nothing but its formation keeps a vehicle from a column of its lane."""
         from_ramp = self._entry_m[arrival.entry_point] > 0.0
+        most, inside = self.most_in_column, self._in_column.get(column, 0)
+        if most is not None and inside >= most and not from_ramp:
+            return False
         if from_ramp and self._is_free is not None and not self._is_free((column, arrival.lane)):
             return False
         return arrival.vehicle_type not in self._column_bound or self._can_keep_column(
@@ -286,10 +300,21 @@ class EntryMeter:
             cell, queue[0].preferred_lane, t_s, column_bound=keeps_column
         ):
             return None
-        if keeps_column:
-            self._keep_column(column, queue[0])
+        self._enter(queue[0], column)
         self._names.discard(queue[0].vehicle)
         return queue.pop(0)
+
+    def _enter(self, arrival: Arrival, column: int) -> None:
+        """Note that a vehicle has entered in a column."""
+        if arrival.vehicle_type in self._column_bound:
+            self._keep_column(column, arrival)
+        if self._entry_m[arrival.entry_point] <= 0.0:
+            self._count_in(column)
+
+    def _count_in(self, column: int) -> None:
+        self._in_column[column] = self._in_column.get(column, 0) + 1
+        while len(self._in_column) > _MAX_KEEPING_COLUMNS:
+            del self._in_column[next(iter(self._in_column))]
 
     def exit_cells(self, arrival: Arrival, column: int) -> tuple[Cell, ...]:
         """Return the cells for leaving by lanes in which a ramp follows the exit.

@@ -13,13 +13,15 @@ enters them is a formation of its own.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 
 from attrs import define, frozen
 
 from laneweave.protocol.lattice import Cell
+from laneweave.protocol.road_layout import LanePosition, TemporaryClosure
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.lane_ends import (
+    NEAR_LINE_M,
     START_S,
     LaneEnd,
     LaneEnds,
@@ -76,25 +78,63 @@ class LaneEndControl:
         self._cells_stay_free = territory_of(scenario).given_up_cells_stay_free
         self._scenario = scenario
         self._lattice = scenario.lattice
-        ends = LaneEnds(scenario)
-        self._any = bool(ends)
-        self._ends = tuple(ends)
-        self._beside = {
-            end: None if end.taken_back else lane_beside(scenario, end) for end in self._ends
-        }
-        needed = re_entry(scenario) if self._ends else None
-        self._columns = needed.columns if needed is not None else 0
-        self._distance_m = needed.distance_m if needed is not None else 0.0
-        """Distance behind a slow vehicle that is needed for re-entry."""
         self._queue_m = scenario.types.longest_body_m + scenario.tracking.min_gap_m
         """Distance between the fronts of vehicles that stand in a queue."""
-        self._gaps: dict[LaneEnd, list[Gap]] = {end: [] for end in self._ends}
+        self._any = False
+        self._ends: dict[LanePosition, LaneEnd] = {}
+        """Dead ends by lane and end; those that have vanished as long as vehicles wait there."""
+        self._beside: dict[LanePosition, int | None] = {}
+        self._columns, self._distance_m, self._room_m = 0, 0.0, 0.0
+        self._gaps: dict[LanePosition, list[Gap]] = {}
+        self.over: frozenset[LanePosition] = frozenset()
+        """Ends of which the cause is over: vehicles start from wherever they wait."""
         self._last_gap_column: dict[int, float] = {}
         """Rearmost column of the last gap, by entry point."""
         self._entered_gaps: list[range] = []
         """Columns of gaps that vehicles have entered, since they were last taken."""
-        self._end_of: dict[Name, LaneEnd | None] = {}
+        self._end_of: dict[Name, LanePosition | None] = {}
         """Dead end at which each vehicle without cells waits or waited; None: its lane has none."""
+        self.close(LaneEnds(scenario))
+
+    def close(self, lane_ends: LaneEnds, closed: Sequence[TemporaryClosure] = ()) -> None:
+        """Replace the ends of lanes.
+
+        Args:
+            lane_ends: those of the road, and of parts that are closed for a time.
+            closed: these parts. One may vanish only when no vehicle waits there (`in_use`).
+        """
+        scenario = self._scenario
+        self._ends = {(end.lane, end.end_m): end for end in lane_ends}
+        self._any = bool(lane_ends)
+        if self._ends:
+            needed = re_entry(scenario)
+            self._columns, self._room_m = needed.columns, needed.room_m
+            self._distance_m = needed.distance_m
+        self._beside = {
+            at: None if end.taken_back else lane_beside(scenario, end, closed)
+            for at, end in self._ends.items()
+        }
+        before, self._gaps = self._gaps, {at: [] for at in self._ends}
+        for at, gaps in before.items():
+            merged = self._merged(at)
+            if merged is not None:
+                self._gaps[merged] += gaps
+        for name, its_end in self._end_of.items():
+            if its_end is not None:
+                self._end_of[name] = self._merged(its_end)
+
+    def _merged(self, at: LanePosition) -> LanePosition | None:
+        """Return an end, or that of the part before it, into which its own part has merged."""
+        if at in self._ends:
+            return at
+        lane, end_m = at
+        ends = (end for end in self._ends.values() if end.lane == lane)
+        return next(((lane, end.end_m) for end in ends if end.end_m <= end_m < end.reopens_m), None)
+
+    @property
+    def in_use(self) -> set[LanePosition]:
+        """The ends at which vehicles wait, or from which they re-enter."""
+        return {at for at in self._end_of.values() if at is not None}
 
     def is_kept_free(self, cell: Cell) -> bool:
         """Return whether a cell belongs to a gap."""
@@ -124,16 +164,17 @@ class LaneEndControl:
                 # While it re-enters, a vehicle may come to another dead end.
                 self._forget(name)
                 yield self._take_off(name, vehicle)
-        for end, gaps in self._gaps.items():
-            waiting = self._waiting(end, vehicles)
-            if waiting:
-                yield from self._start(waiting[0], gaps, t_s)
-                waiting = self._waiting(end, vehicles)
+        for at, gaps in self._gaps.items():
+            startable = self._startable(at, vehicles)
+            if startable:
+                yield from self._start(startable[0], gaps, t_s)
+                startable = self._startable(at, vehicles)
             yield from self._arrive(gaps, vehicles, t_s)
-            gaps[:] = [gap for gap in gaps if gap.vehicle or not self._is_over(gap, end, t_s)]
+            last_m = max([self._ends[at].line_m, *(one.state[0] for one in startable[:1])])
+            gaps[:] = [gap for gap in gaps if gap.vehicle or not self._is_over(gap, last_m, t_s)]
             coming = sum(gap.vehicle is None for gap in gaps)
-            if len(waiting) > coming:
-                self._request(end, gaps, t_s)
+            if len(startable) > coming:
+                self._request(at, gaps, t_s)
 
     def bodies(self, vehicles: Mapping[Name, RoadVehicle]) -> dict[Name, OffLattice]:
         """Return the lane and the rear of each vehicle without cells.
@@ -141,8 +182,8 @@ class LaneEndControl:
         A vehicle that still drives up to its line counts as where it will stand.
         """
         found: dict[Name, OffLattice] = {}
-        for end in self._ends:
-            for number, vehicle in enumerate(self._waiting(end, vehicles)):
+        for at, end in self._ends.items():
+            for number, vehicle in enumerate(self._waiting(at, vehicles)):
                 stands_m = end.line_m - number * self._queue_m
                 rear_m = max(vehicle.state[0], stands_m) - vehicle.size[0]
                 found[vehicle.name] = OffLattice(end.lane, rear_m)
@@ -153,9 +194,10 @@ class LaneEndControl:
                 found[name] = OffLattice(lane, s_m - vehicles[name].size[0])
         return found
 
-    def _request(self, end: LaneEnd, gaps: list[Gap], t_s: float) -> None:
+    def _request(self, at: LanePosition, gaps: list[Gap], t_s: float) -> None:
         """Keep the next columns beside an end free, unless the last gap was too close ahead."""
-        lane = self._beside[end]
+        over = at in self.over and self._may_pass(self._ends[at])
+        lane = at[0] if over else self._beside[at]
         if lane is None:
             return  # SUMO takes the vehicle back
         # Behind the first entry point of the lane, vehicles may own its cells.
@@ -163,27 +205,61 @@ class LaneEndControl:
         taken = self._meter.points_kept_free(point)
         crowded = any(arrival.entry_point in taken for arrival in self._meter.waiting)
         between = (CROWDED_GAPS if crowded else OPEN_GAPS) * self._columns
+        if over:
+            between = 0  # no other vehicle uses the lane
         last = self._last_gap_column.get(point, math.inf)
         if self._meter.next_column(point) < last - between:
             columns = self._meter.keep_free(point, self._columns, t_s)
             self._last_gap_column |= dict.fromkeys(taken, columns[0])
             gaps.append(Gap(lane, columns))
 
+    def _may_pass(self, end: LaneEnd) -> bool:
+        """Return whether a vehicle that starts in its own lane settles before the next dead end."""
+        settles_m = end.reopens_m + self._distance_m
+        later = (other for other in self._ends.values() if other.lane == end.lane)
+        return all(other.line_m >= settles_m for other in later if other.end_m > end.end_m)
+
+    def take_off(self, name: Name, vehicle: RoadVehicle) -> LaneEndChange:
+        """Take a vehicle off the lattice that has broken down, or whose lane ends."""
+        self._forget(name)
+        return self._take_off(name, vehicle)
+
     def _take_off(self, name: Name, vehicle: RoadVehicle) -> LaneEndChange:
         vehicle.controller.leave_lattice()
         lane, s_m = vehicle.controller.hold_cell[1], vehicle.state[0]
-        ends = [end for end in self._ends if end.lane == lane]
+        ends = [(at, end) for at, end in self._ends.items() if end.lane == lane]
         # The first that the body has not passed.
-        last = ends[-1] if ends else None
-        self._end_of[name] = next((end for end in ends if s_m < end.reopens_m), last)
+        at, end = next(
+            (each for each in ends if s_m < each[1].reopens_m), ends[-1] if ends else (None, None)
+        )
+        vehicle.controller.stays = end is not None and end.sudden
+        self._end_of[name] = at
         return LaneEndChange(name, LEFT_LATTICE, lane)
 
-    def _waiting(self, end: LaneEnd, vehicles: Mapping[Name, RoadVehicle]) -> list[RoadVehicle]:
+    def _startable(
+        self, at: LanePosition, vehicles: Mapping[Name, RoadVehicle]
+    ) -> list[RoadVehicle]:
+        """Return the vehicles that may start from where they wait, foremost first.
+
+        Those beyond the line have no room to start before what is ahead is gone.
+        """
+        waiting = self._waiting(at, vehicles)
+        if at in self.over:
+            return waiting
+        line_m = self._ends[at].line_m + NEAR_LINE_M
+        startable = [one for one in waiting if one.state[0] <= line_m]
+        beyond = waiting[: len(waiting) - len(startable)]
+        if startable and beyond:
+            rear_m = beyond[-1].state[0] - beyond[-1].size[0]
+            return startable if rear_m - startable[0].state[0] >= self._room_m else []
+        return startable
+
+    def _waiting(self, at: LanePosition, vehicles: Mapping[Name, RoadVehicle]) -> list[RoadVehicle]:
         """Return the vehicles that wait at a dead end, foremost first."""
         waiting = [
             vehicles[name]
             for name, its_end in self._end_of.items()
-            if its_end == end
+            if its_end == at
             and name in vehicles
             and vehicles[name].controller.off_lattice is OffLatticePhase.WAITING
         ]
@@ -217,7 +293,13 @@ class LaneEndControl:
             other.gap_m > (BESIDE_M if other.speed_mps > slow_mps else self._distance_m)
             for other in neighbours.ahead
             if other.lane == gap.lane
-        ) and all(other.gap_m > behind_m for other in neighbours.behind if other.lane == gap.lane)
+        ) and all(
+            other.gap_m > behind_m
+            for other in neighbours.behind
+            if other.lane == gap.lane
+            # Behind a vehicle that starts in its own lane, others wait.
+            and (other.speed_mps > STANDING_MPS or gap.lane != vehicle.body_lane)
+        )
 
     def _arrive(
         self, gaps: list[Gap], vehicles: Mapping[Name, RoadVehicle], t_s: float
@@ -233,12 +315,12 @@ class LaneEndControl:
             self._entered_gaps.append(gap.columns)
             yield LaneEndChange(name, ENTERED_LATTICE, gap.lane)
 
-    def _is_over(self, gap: Gap, end: LaneEnd, t_s: float) -> bool:
-        """Return whether all of a gap has passed the stop line."""
-        return t_s > self._lattice.passing_time_s(gap.columns[-1], end.line_m) + START_S
+    def _is_over(self, gap: Gap, last_m: float, t_s: float) -> bool:
+        """Return whether all of a gap has passed the line, and the first vehicle that may start."""
+        return t_s > self._lattice.passing_time_s(gap.columns[-1], last_m) + START_S
 
     def _forget(self, name: Name) -> None:
         """Forget a vehicle, and the gap into which it drives."""
-        end = self._end_of.pop(name, None)
-        if end is not None:
-            self._gaps[end][:] = [gap for gap in self._gaps[end] if gap.vehicle != name]
+        at = self._end_of.pop(name, None)
+        if at is not None:
+            self._gaps[at][:] = [gap for gap in self._gaps[at] if gap.vehicle != name]

@@ -7,16 +7,21 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 
 from laneweave.protocol.lattice import Cell
+from laneweave.protocol.road_layout import TemporaryClosure, cut
 from laneweave.protocol.runtime.node import Effect
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.emergency_brake import EmergencyBrake
+from laneweave.protocol.vehicle.lane_ends import LaneEnds
+from laneweave.protocol.wire.events import PART_CLOSED, PART_OPENED
 from laneweave.protocol.wire.messages import ClosedFormation, Name, Neighbour
+from laneweave.protocol.wire.obstacle_messages import Obstacle
 from laneweave.sim_bridge.road.allocation import NO_VEHICLES, Allocation, allocation_of
 from laneweave.sim_bridge.road.census import CensusPublisher
 from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.road.demand_queue import NO_OUTSIDE_TRAFFIC, DemandQueue, OutsideTraffic
 from laneweave.sim_bridge.road.entry import Admission, EntryMeter, Goals
 from laneweave.sim_bridge.road.lane_end_control import LaneEndChange, LaneEndControl
+from laneweave.sim_bridge.road.obstacles import Breakdown, Obstacles
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
 
 QUEUE_ROOM_M = 20.0
@@ -100,6 +105,7 @@ class Roadside:
         bridge: int = 0,
         outside_traffic: OutsideTraffic = NO_OUTSIDE_TRAFFIC,
         allocation: Allocation | None = None,
+        breakdowns: Iterable[Breakdown] = (),
     ) -> None:
         """Begin without vehicles.
 
@@ -109,6 +115,7 @@ class Roadside:
             bridge: incarnation of the bridge.
             outside_traffic: further vehicles, which a simulator drives to entrances.
             allocation: what vehicles get besides their cells; None: that of the operation.
+            breakdowns: vehicles that break down.
         """
         self.outside = outside_traffic
         self._allocation = allocation or allocation_of(scenario, self.is_kept_free)
@@ -124,6 +131,13 @@ class Roadside:
             is_free=self._allocation.is_free,
         )
         self._lane_ends = LaneEndControl(scenario, self._meter)
+        self._scenario = scenario
+        self.obstacles = Obstacles(scenario, breakdowns)
+        self._closed: tuple[TemporaryClosure, ...] = ()
+        self._told: tuple[Obstacle, ...] = ()
+        """Obstacles of which events have been logged."""
+        self.lane_ends = LaneEnds(scenario)
+        """Ends of lanes now, which motion controllers know."""
         self._room = EntranceRoom(scenario)
         self.demand = DemandQueue(scenario, stream, self._meter, outside_traffic)
         self.publisher = CensusPublisher(
@@ -158,10 +172,53 @@ class Roadside:
 
         Must be called before `assign_empty_cells`, from which gaps are excluded.
         """
-        changes = list(self._lane_ends.update(vehicles, t_s))
+        changes = [] if not self.obstacles else list(self._close_parts(vehicles, t_s))
+        changes += self._lane_ends.update(vehicles, t_s)
         if changes:
             self.publisher.on_changed()
         return changes
+
+    def _close_parts(
+        self, vehicles: Mapping[Name, RoadVehicle], t_s: float
+    ) -> Iterator[LaneEndChange]:
+        """Close parts of lanes for a time, and open them again."""
+        obstacles, control = self.obstacles, self._lane_ends
+        broken = list(obstacles.update(vehicles, t_s, control.in_use))
+        if obstacles.closed != self._closed:
+            self._closed = obstacles.closed
+            self.lane_ends = LaneEnds(self._scenario, self._closed)
+            self.publisher.on_changed()
+            self._meter.most_in_column = self._lanes_past(self._closed)
+            for vehicle in vehicles.values():
+                vehicle.close(self.lane_ends)
+            control.close(self.lane_ends, self._closed)
+        control.over = obstacles.over(t_s)
+        self.publisher.obstacles = tuple(one.message for one in obstacles.active)
+        for vehicle in broken:
+            yield control.take_off(vehicle.name, vehicle)
+
+    def pop_obstacle_changes(self) -> Iterator[tuple[str, Obstacle]]:
+        """Yield what has changed since the last call: kinds of events, and obstacles."""
+        before, self._told = self._told, self.publisher.obstacles
+        if self._told is not before:
+            yield from ((PART_CLOSED, one) for one in self._told if one not in before)
+            now = {(one.lane, one.from_m) for one in self._told}
+            gone = (one for one in before if (one.lane, one.from_m) not in now)
+            yield from ((PART_OPENED, one) for one in gone)
+
+    def _lanes_past(self, closed: Sequence[TemporaryClosure]) -> int | None:
+        """Return the number of lanes in which vehicles can pass closed parts; None: there are none.
+
+        Lanes that are closed beside each other count at each place.
+        """
+        sections = cut(self._scenario.geometry.sections, closed)
+        return min(
+            (
+                len({each.lane for each in sections if each.from_m <= one.from_m < each.to_m})
+                for one in closed
+            ),
+            default=None,
+        )
 
     def close_formations(self, t_s: float) -> list[ClosedFormation]:
         """Return the formations closed since the last call.

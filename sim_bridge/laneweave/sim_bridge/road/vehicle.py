@@ -10,6 +10,7 @@ from attrs import define, evolve
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.vehicle_tables import Vehicle
+from laneweave.protocol.vehicle.lane_ends import LaneEnds
 from laneweave.protocol.vehicle.motion import State, cell_state
 from laneweave.protocol.wire.messages import ClosedFormation, CurrentMotion, Name, Sense
 from laneweave.sim_bridge.bodies.command_checks import NEIGHBOURING
@@ -93,6 +94,13 @@ class RoadVehicle:
         return int(self.state[3] // self.controller.lattice.lane_width_m)
 
     @property
+    def lanes_touched(self) -> range:
+        """Lanes in which parts of the body are."""
+        lattice = self.controller.lattice
+        first, last = lattice.lanes_touched(self.state[3], self.size[1])
+        return range(first, last + 1)
+
+    @property
     def keeps_lane(self) -> bool:
         """Whether the body is in its lane, and no plan in force leads it out of its cell."""
         return self.controller.keeps_lane
@@ -101,6 +109,10 @@ class RoadVehicle:
     def block(self) -> int:
         """Number of the block in which the vehicle entered."""
         return self.controller.lattice.block_of(self.admission.cell[0])
+
+    def close(self, lane_ends: LaneEnds) -> None:
+        """Replace the ends of lanes: parts of lanes are closed for a time, or open again."""
+        self.controller.stop_lines.lane_ends = lane_ends
 
     def join(self, closed: ClosedFormation) -> None:
         """Join a closed formation: plans must cover all of its blocks."""

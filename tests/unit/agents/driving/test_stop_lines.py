@@ -29,7 +29,7 @@ def test_a_reference_that_stays_in_a_lane_is_limited_to_its_line() -> None:
     (end,) = dead_ends(KEEPING)
     tick = tick_at(end.line_m - 10.0)
     states = Reference.hold(KEEPING, KEEPING.vehicle, (COLUMN, 1)).window(tick).states
-    limited = StopLines(KEEPING, KEEPING.vehicle).limit(NO_GAPS, states, states[0, 0])
+    limited = StopLines(KEEPING, KEEPING.vehicle).limit(NO_GAPS, states, tuple(states[0]))
     assert limited.latest is not None
     assert np.all(limited.latest < end.line_m)
 
@@ -46,4 +46,4 @@ def test_a_reference_into_a_lane_that_opens_again_is_not_limited(
     ticks = KEEPING.timing.move_ticks(KEEPING.timing.cycles_s[0])
     reference = Reference.move(KEEPING, KEEPING.vehicle, *cells, begin_tick, ticks)
     states = reference.window(begin_tick + round(s_m / LATTICE.speed_mps / TICK_S)).states
-    assert StopLines(KEEPING, KEEPING.vehicle).limit(NO_GAPS, states, states[0, 0]) is NO_GAPS
+    assert StopLines(KEEPING, KEEPING.vehicle).limit(NO_GAPS, states, tuple(states[0])) is NO_GAPS

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from itertools import count
 from typing import Any
 
@@ -14,10 +14,11 @@ from msgspec.structs import replace
 
 from laneweave.coordinator.ballots.ballot_round import BallotPhase
 from laneweave.coordinator.operation import LogEntry
-from laneweave.coordinator.planning.rolling.problem import NO_ENDS, StreamPlan, StreamVehicle
+from laneweave.coordinator.planning.rolling.problem import Sections, StreamPlan, StreamVehicle
 from laneweave.coordinator.rolling.checked_planner import checked, stream_planner, stream_road
 from laneweave.coordinator.rolling.known_road import LOOKAHEAD_M, MARGIN_COLUMNS
 from laneweave.coordinator.rolling.operation import (
+    AGAIN_S,
     LISTEN_S,
     MAX_DELAY_S,
     RollingOperation,
@@ -26,9 +27,11 @@ from laneweave.coordinator.rolling.operation import (
 from laneweave.coordinator.rolling.transfer import CellTransfer
 from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.lattice import Cell
+from laneweave.protocol.road_layout import TemporaryClosure
 from laneweave.protocol.runtime.node import Compute, Computed
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.formation_table import READY_LATE_S, SNAPSHOT_S
+from laneweave.protocol.vehicle.lane_ends import re_entry
 from laneweave.protocol.wire.messages import (
     Ballot,
     Census,
@@ -84,7 +87,7 @@ class Call:
     vehicles: dict[str, StreamVehicle]
     before: StreamPlan | None
     blocked: frozenset[Cell]
-    ends_m: dict[int, float]
+    sections: Sections | None
 
 
 def place_m(state: State) -> float:
@@ -119,10 +122,10 @@ class Bench:
         vehicles: Iterable[StreamVehicle],
         before: StreamPlan | None = None,
         blocked: Iterable[Cell] = (),
-        ends_m: Mapping[int, float] = NO_ENDS,
+        sections: Sections | None = None,
     ) -> StreamPlan:
         asked = {vehicle.vehicle: vehicle for vehicle in vehicles}
-        self.calls.append(Call(slot, asked, before, frozenset(blocked), dict(ends_m)))
+        self.calls.append(Call(slot, asked, before, frozenset(blocked), sections))
         return StreamPlan(slot, self.ways, self.missed)
 
     def new_job(self) -> int:
@@ -183,6 +186,58 @@ def test_plans_the_next_slot_when_this_one_s_moves_are_shown() -> None:
     assert desk.order(BEGUN_S + SLOT_S + SNAPSHOT_S) is None
     desk.think(LOOK_S + SLOT_S)
     assert [call.slot for call in desk.calls] == [SLOT + 1, SLOT + 2]
+
+
+PART = TemporaryClosure(1, 600.0, 650.0)
+
+
+def test_a_slot_is_planned_again_when_a_part_of_a_lane_is_closed() -> None:
+    desk = bench(A, B)
+    desk.think()
+    desk.control.on_obstacles([PART])
+    desk.think(LOOK_S + 1.0)
+    assert [call.slot for call in desk.calls] == [SLOT + 1, SLOT + 1]
+    desk.control.on_obstacles([PART])  # repeated
+    assert desk.order(LOOK_S + 1.5) is None
+
+
+def test_a_slot_that_begins_soon_is_not_planned_again() -> None:
+    desk = bench(A, B)
+    desk.think()
+    desk.control.on_obstacles([PART])
+    assert desk.order(BEGUN_S + SLOT_S - AGAIN_S + 0.1) is None
+    call = desk.call(LOOK_S + SLOT_S)
+    assert call.slot == SLOT + 2
+    assert call.sections is not None
+    assert len(call.sections) == 4
+
+
+def test_vehicles_in_force_are_left_alone_when_a_slot_is_planned_again() -> None:
+    desk = bench(A, B, ways={A: ((0, 0), (1, 0))})
+    desk.think()
+    transfer = desk.transfer
+    transfer.phase = BallotPhase.IN_FORCE
+    desk.control.on_obstacles([PART])
+    call = desk.call(LOOK_S + 1.0)
+    assert {name for name, one in call.vehicles.items() if one.waits} == set(transfer.roster)
+    assert transfer in desk.control.transfers
+
+
+@pytest.mark.parametrize(("from_m", "waits"), [(800.0, 0), (700.0, 1)])
+def test_a_lane_that_is_closed_ends_before_the_queue_of_those_that_cannot_leave_it(
+    from_m: float, waits: int
+) -> None:
+    """B is at 570 m when the slot begins, and needs 90 m to leave the lane."""
+    desk = bench(A, B)
+    desk.control.on_obstacles([TemporaryClosure(1, from_m, from_m + 50.0)])
+    sections = desk.call().sections
+    assert sections is not None
+    queue_m = ROLLING.types.longest_body_m + ROLLING.tracking.min_gap_m
+    line_m = from_m - re_entry(ROLLING).room_m
+    (closing,) = sections[3:]
+    assert (closing.lane, closing.to_m) == (1, line_m - waits * queue_m)
+    # Behind the part, no path may begin that has passed it within a slot.
+    assert sections[1].from_m >= from_m + 50.0
 
 
 def test_only_one_planning_at_a_time() -> None:
@@ -387,7 +442,9 @@ def test_vehicles_without_cells_are_not_planned_and_end_the_sections_they_are_in
     )
     desk.think()
     assert set(desk.calls[0].vehicles) == {A}
-    assert desk.calls[0].ends_m == {1: 700.0}
+    sections = desk.calls[0].sections
+    assert sections is not None
+    assert [section.to_m for section in sections] == [1000.0, 700.0, 1000.0]
 
 
 def test_states_may_arrive_in_any_order() -> None:

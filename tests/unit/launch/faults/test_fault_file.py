@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
 import pytest
+from attrs import evolve
 
+from laneweave.launch.faults.breakdowns import breakdowns_of
 from laneweave.launch.faults.fault_file import (
     GROUPS,
+    BreakdownFault,
     FaultSpec,
     Kill,
     LinkFault,
@@ -19,6 +23,7 @@ from laneweave.launch.faults.fault_file import (
 )
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.runtime.message_faults import MessageRule
+from support.paper import PAPER
 from support.tables import for_each
 
 COORDINATORS = ("c1", "c2")
@@ -347,3 +352,59 @@ def test_a_file_takes_precedence_over_a_preset(
     monkeypatch.chdir(tmp_path)
     (tmp_path / "lossy10").write_text("seed = 3\n", encoding="utf-8")
     assert load_faults("lossy10", COORDINATORS) == FaultSpec(seed=3)
+
+
+# --- breakdowns -------------------------------------------------------------------------------
+
+
+def test_a_breakdown_names_its_vehicle_or_says_which_ones(tmp_path: Path) -> None:
+    found = load(
+        tmp_path,
+        """
+        [[breakdown]]
+        vehicle = "v0002"
+        at_s = 3
+        for_s = 20
+        [[breakdown]]
+        count = 3
+        at_s = 5
+        lane = 1
+        at_m = 300
+        decel_mps2 = 4
+        """,
+    )
+    assert found.breakdown == (
+        BreakdownFault(vehicle="v0002", at_s=3.0, for_s=20.0),
+        BreakdownFault(count=3, at_s=5.0, lane=1, at_m=300.0, decel_mps2=4.0),
+    )
+    first, *others = breakdowns_of(found, PAPER)
+    assert (first.vehicle, first.for_s) == ("v0002", 20.0)
+    assert [(one.vehicle, one.lane, one.at_m, one.decel_mps2) for one in others] == [
+        (None, 1, 300.0, 4.0)
+    ] * 3
+    assert all(math.isinf(one.for_s) for one in others)
+    draws = [one.draw for one in others]
+    assert len(set(draws)) == 3
+    assert [one.draw for one in breakdowns_of(found, PAPER)[1:]] == draws
+    assert [
+        one.draw for one in breakdowns_of(found, evolve(PAPER, seed=PAPER.seed + 1))[1:]
+    ] != draws
+
+
+@for_each(
+    ("text", "field"),
+    [
+        ('vehicle = "v0009"\nat_s = 1', "breakdown[0].vehicle"),
+        ('vehicle = "v0001"\ncount = 2\nat_s = 1', "breakdown[0].count"),
+        ("lane = 1", "breakdown[0].at_s"),
+        ("at_s = 1\nlane = -1", "breakdown[0].lane"),
+        ("at_s = 1\ndecel_mps2 = 0.1", "breakdown[0].decel_mps2"),
+        ("at_s = 1\nfor_s = -1", "breakdown[0].for_s"),
+        ("at_s = 1\ncount = 0", "breakdown[0].count"),
+        ("at_s = nan", "breakdown[0].at_s"),
+    ],
+)
+def test_a_wrong_breakdown_is_refused_with_its_field(tmp_path: Path, text: str, field: str) -> None:
+    with pytest.raises(BadInputError) as refused:
+        load(tmp_path, f"[[breakdown]]\n{text}\n")
+    assert field in str(refused.value)

@@ -60,6 +60,10 @@ def ends_at(end_m: float) -> Callable[[Tables], object]:
     return change
 
 
+PART = {"from_m": 400.0, "to_m": 450.0, "at_s": 5.0}
+"""An event of the road, but for its lane."""
+
+
 @for_each(("change", "line"), [
         (entrance(lane=1), "entrance[0].lane: got 1"),
         (entrance(at_m=300.0), "entrance[0].at_m: got 300.0; allowed: 250"),
@@ -121,6 +125,15 @@ def ends_at(end_m: float) -> Callable[[Tables], object]:
                 closures=[{"lane": lane} for lane in range(4)]
             ),
             "road.closures",
+        ),
+        *(
+            (lambda tables, event=event: tables["road"].update(events=[event]), problem)
+            for event, problem in (
+                ({"lane": 4} | PART, "road.events[0].lane: got 4; allowed: a lane from 0 to 3"),
+                ({"lane": 1} | PART | {"to_m": 300.0}, "road.events[0].to_m: got 300.0; allowed: "),
+                ({"lane": 1} | PART | {"until_s": 5.0}, "road.events[0].until_s: got 5.0; allowed"),
+                ({"lane": 1} | PART | {"to_m": 9e3}, "road.events[0].from_m: got 400.0; allowed: "),
+            )
         ),
         (
             lambda tables: tables.update(formation={"max_columns": 14}),

@@ -44,6 +44,7 @@ SINGLE_ROLE_FIELDS = {
     "formation.structures": "coordinator",
     "formation.conflicts": "coordinator; vehicles check the footprints of a plan themselves",
     "formation.reward_drift": "coordinator",
+    "road.events": "bridge, which tells all others",
     "tracking.horizon_ticks": "agent",
     "tracking.shortcut": "agent",
     "runtime.tick_resend_s": "bridge",

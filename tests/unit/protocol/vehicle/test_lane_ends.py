@@ -249,7 +249,7 @@ def test_no_command_takes_a_vehicle_past_its_stop_line(data: st.DataObject) -> N
 
 def lines(controller: MotionController, tick: int) -> list[Neighbour]:
     """Return the stop lines that a controller sees at a tick."""
-    return controller._stop_lines.lines(
+    return controller.stop_lines.lines(
         controller.measured,
         controller.hold_cell,
         tick * controller.tick_s,

@@ -16,7 +16,7 @@ from msgspec.structs import FieldInfo, fields
 
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.names import NAME_PATTERN
-from laneweave.protocol.wire import messages, process_messages
+from laneweave.protocol.wire import messages, obstacle_messages, process_messages
 from laneweave.protocol.wire.codec import KINDS, MAX_BYTES, VERSION, decode, encode
 from laneweave.protocol.wire.messages import Ballot, Heartbeat, Name, Plan, RoadClock, Sense
 from laneweave.protocol.wire.process_messages import Report
@@ -154,7 +154,7 @@ def changed(sample: object, name: str, value: object) -> bytes:
 
 
 def test_every_class_of_a_message_has_a_sample() -> None:
-    modules = messages, process_messages
+    modules = messages, obstacle_messages, process_messages
     found = [one for module in modules for one in vars(module).values() if is_struct(one)]
     classes = {one for one in found if one.__module__ in [module.__name__ for module in modules]}
     assert classes == set(HINTS)

@@ -66,7 +66,7 @@ def test_topics_are_distinct_and_have_no_reserved_characters() -> None:
 
 def test_only_short_messages_that_the_next_one_replaces_may_be_lost_by_a_link() -> None:
     unreliable = {topic.name for topic in topics.TOPICS if not topic.reliable}
-    assert unreliable == {"clock", "state", "motion", "heartbeat"}
+    assert unreliable == {"clock", "state", "motion", "heartbeat", "obstacles"}
 
 
 def test_every_message_kind_has_one_topic() -> None:

@@ -437,6 +437,7 @@ def _paths(
     # In row-major order, for which the kernels are compiled.
     in_target = np.take(target, own_zones.section, axis=1)
     zone_cost = np.where(in_target, 0.0, costs.off_lane)
+    zone_cost[:, np.isin(own_zones.section, road.closing)] += costs.closing
     with_rules = rules.group > 0
     zone_cost[with_rules] += costs.restricted * own_zones.restricted[rules.group[with_rules] - 1]
     missing_cost = costs.missing * (1.0 + 1.0 / (1.0 + chances))

@@ -25,8 +25,8 @@ import numpy as np
 from laneweave.coordinator.planning.rolling import search_kernel as kernel
 from laneweave.coordinator.planning.rolling.arrays import Ints, Window, window
 from laneweave.coordinator.planning.rolling.problem import (
-    NO_ENDS,
     CellPath,
+    Sections,
     StreamCosts,
     StreamPlan,
     StreamRoad,
@@ -58,7 +58,7 @@ class StreamPlanner:
         vehicles: Sequence[StreamVehicle],
         before: StreamPlan | None = None,
         blocked: Collection[Cell] = (),
-        ends_m: Mapping[int, float] = NO_ENDS,
+        sections: Sections | None = None,
     ) -> StreamPlan:
         """Return paths for all vehicles from the beginning of a slot on.
 
@@ -67,13 +67,13 @@ class StreamPlanner:
             vehicles: all vehicles on the road, each in a different cell.
             before: an earlier plan; the search starts from its paths that are still valid.
             blocked: cells that must not be entered; a vehicle in one may leave it.
-            ends_m: sections that end earlier now [m], by index.
+            sections: where the lanes are open now; None: as on the road.
 
         Raises:
             ValueError: two vehicles share a cell, or one is off the lanes.
         """
         began_s = time.monotonic()
-        road = self.road.ending_at(ends_m)
+        road = self.road.with_sections(sections)
         _check(road, vehicles)
         end = road.length_m - slot * road.advance_m
         paths: dict[str, CellPath] = {v.vehicle: (v.cell,) for v in vehicles}

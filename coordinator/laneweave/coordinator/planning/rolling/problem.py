@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from functools import cached_property
-from types import MappingProxyType
 
 from attrs import Attribute, Factory, evolve, field, frozen
 
@@ -18,8 +17,8 @@ from laneweave.protocol.wire.messages import CAR
 ROUNDING_M = 1e-6
 """Tolerance for comparing positions."""
 
-NO_ENDS: Mapping[int, float] = MappingProxyType({})
-"""No earlier ends: each section may be used up to its end on the road."""
+Sections = tuple[LaneSection, ...]
+"""Where the lanes are open; a section keeps its number while parts of it are closed for a time."""
 Section = tuple[float, float, int]
 """Begin and end of a lane section [m] for planning, and its index in `StreamRoad.sections`."""
 CellPath = tuple[Cell, ...]
@@ -65,6 +64,11 @@ class StreamRoad:
     """Where vehicles of some types may not drive."""
     solid_lines: tuple[SolidLine, ...] = ()
     """Lines that vehicles may not cross."""
+    closing: range = range(0)
+    """Indices of the sections that end before a part that is closed for a time."""
+    around_m: float | None = None
+    """Position from which vehicles may move while parts of lanes are closed for a time; None: as
+    always."""
 
     def rules_of(self, vehicle_type: str) -> list[LaneRule]:
         """Return the restrictions and solid lines that apply to a type of vehicle."""
@@ -115,15 +119,14 @@ class StreamRoad:
         """Return where moves end before the end of a section, whose end for planning is `to_m`."""
         return max(to_m, self.sections[number].to_m) if self.sections[number].exit else to_m
 
-    def ending_at(self, ends_m: Mapping[int, float]) -> StreamRoad:
-        """Return the road with earlier ends of some sections [m], by index."""
-        if not ends_m:
+    def with_sections(self, sections: Sections | None) -> StreamRoad:
+        """Return the road with the sections that are open now; None: as they are."""
+        if sections is None or sections == self.sections:
             return self
-        sections = tuple(
-            evolve(section, to_m=min(section.to_m, ends_m.get(number, math.inf)))
-            for number, section in enumerate(self.sections)
-        )
-        return evolve(self, sections=sections)
+        closing, sorting_m = range(len(self.sections), len(sections)), self.sorting_m
+        if closing and self.around_m is not None:
+            sorting_m = self.around_m, sorting_m[1]
+        return evolve(self, sections=sections, sorting_m=sorting_m, closing=closing)
 
     def position_m(self, slot: int, column: int) -> float:
         """Return the position of a column at the beginning of a slot."""
@@ -210,6 +213,8 @@ class StreamCosts:
     """Extra cost of a move that gains a column; a negative cost rewards gaining columns."""
     missing: float = 60.0
     """Cost of ending elsewhere than at a target; up to twice as much near the end."""
+    closing: float = 10.0
+    """Extra cost of each slot in a lane that ends before a part that is closed for a time."""
     restricted: float = 20.0
     """Cost of each slot in which the vehicle drives where it may not; less on long roads, since the
     costs of a path must remain below those of forbidden moves."""

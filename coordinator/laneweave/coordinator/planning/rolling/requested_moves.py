@@ -12,8 +12,8 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 
 from laneweave.coordinator.planning.rolling.problem import (
-    NO_ENDS,
     CellPath,
+    Sections,
     StreamPlan,
     StreamRoad,
     StreamVehicle,
@@ -42,11 +42,11 @@ class RequestPlanner:
         vehicles: Sequence[StreamVehicle],
         before: StreamPlan | None = None,
         blocked: Collection[Cell] = (),
-        ends_m: Mapping[int, float] = NO_ENDS,
+        sections: Sections | None = None,
     ) -> StreamPlan:
         """Return paths with the granted moves in this slot; see `StreamPlanner.plan`."""
         del before
-        road, closed = self.road.ending_at(ends_m), frozenset(blocked)
+        road, closed = self.road.with_sections(sections), frozenset(blocked)
         moves = {vehicle.cell: WAIT for vehicle in vehicles}
         for vehicle in vehicles:
             wanted = self.requests.get(vehicle.vehicle, WAIT)

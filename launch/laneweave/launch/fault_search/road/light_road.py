@@ -21,6 +21,7 @@ from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.lane_ends import LaneEnds
 from laneweave.protocol.wire.events import DRIVES_OUT, ENTERED_LATTICE, LEFT_LATTICE, MISSED_EXIT
 from laneweave.protocol.wire.messages import ClosedFormation, Command, Name, Plan, Prepare, Sense
+from laneweave.protocol.wire.obstacle_messages import Obstacle
 from laneweave.sim_bridge.bodies.command_checks import Refusal
 from laneweave.sim_bridge.recording.run_record import RecordedVehicle
 from laneweave.sim_bridge.road.demand import Arrival
@@ -220,6 +221,9 @@ class LightRoad:
     def on_refused(self, t_s: float, vehicle: Name, refusal: Refusal) -> None:
         """Report a refused command, which is a violation: all agents are correct here."""
         self._checker.refused(self.began_s + t_s, vehicle, refusal.problem.value)
+
+    def on_obstacle(self, t_s: float, kind: str, obstacle: Obstacle) -> None:
+        """Do nothing: stories have no closed parts."""
 
     def on_lane_end(self, t_s: float, vehicle: Name, lane: int, kind: str) -> None:
         """Let a body stop before the end of its lane, and come back; see `LaneEndControl`."""

@@ -7,12 +7,12 @@ from __future__ import annotations
 
 import math
 import random
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 
 from laneweave.agents.driving.driver import Drive, SolverStats
 from laneweave.coordinator.planning.rolling.problem import (
-    NO_ENDS,
     CellPath,
+    Sections,
     StreamPlan,
     StreamVehicle,
 )
@@ -20,6 +20,7 @@ from laneweave.coordinator.rolling.checked_planner import stream_road
 from laneweave.protocol.lattice import Cell, PlannedMove, displacements, footprint
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.vehicle_tables import Vehicle
+from laneweave.protocol.vehicle.lane_ends import LaneEnds
 from laneweave.protocol.vehicle.motion import at_rest_in_cell
 from laneweave.protocol.wire.messages import CurrentMotion, Motion, Sense
 
@@ -71,6 +72,9 @@ class LightDriver:
     def motion(self, tick: int) -> None:
         """Publish no motion; motions would only slow down the search."""
 
+    def close(self, lane_ends: LaneEnds) -> None:
+        """Do nothing: it drives without stop lines."""
+
     def on_motion(self, motion: Motion) -> None:
         """Ignore motions of other vehicles."""
 
@@ -105,10 +109,10 @@ class LightPlanner:
         vehicles: Sequence[StreamVehicle],
         before: StreamPlan | None = None,
         blocked: Collection[Cell] = (),
-        ends_m: Mapping[int, float] = NO_ENDS,
+        sections: Sections | None = None,
     ) -> StreamPlan:
         """Return the cells of all vehicles at the start and the end of the next slot."""
-        del before, ends_m
+        del before, sections
         rng = random.Random(f"{self._seed}/{slot}")  # noqa: S311 (simulation, no secrets)
         taken = {vehicle.cell for vehicle in vehicles} | set(blocked)
         paths: dict[str, CellPath] = {vehicle.vehicle: (vehicle.cell,) for vehicle in vehicles}

@@ -8,6 +8,7 @@ from random import Random
 import attrs
 import numpy as np
 import pytest
+from attrs import evolve
 from hypothesis import given
 
 from laneweave.coordinator.planning.conflict_kinds import ConflictModel
@@ -285,6 +286,35 @@ def test_a_vehicle_in_a_lane_without_way_out_is_planned_to_its_end() -> None:
     plan = StreamPlanner(road).plan(0, [late])
     assert plan.paths == {"late": ((52, 1), (52, 1))}
     assert plan.missed == ("late",)
+
+
+OPEN = lanes(*through(0, 1), start_m=400.0)
+CLOSED_AT_700 = (
+    LaneSection(0, 0.0, 1000.0, exit="end"),
+    LaneSection(1, 790.0, 1000.0, exit="end"),
+    LaneSection(1, 0.0, 700.0),
+)
+
+
+@pytest.mark.parametrize("lane", [0, 1])
+def test_no_lane_is_missed_in_the_lane_that_is_closed(lane: int) -> None:
+    """Neither vehicle can reach its lane, and it costs the same wherever they miss it."""
+    vehicle = StreamVehicle("a", (28, lane), 1)  # at 420 m; behind 790 m there is no room
+    road = evolve(OPEN.with_sections(CLOSED_AT_700), sorting_m=(400.0, 700.0))
+    plan = StreamPlanner(road).plan(0, [vehicle])
+    assert plan.missed == ("a",)
+    assert plan.paths["a"][-1][1] == 0
+
+
+def test_lanes_are_changed_earlier_while_a_part_is_closed() -> None:
+    early = evolve(OPEN, around_m=100.0)
+    assert early.with_sections(CLOSED_AT_700).sorting_m[0] == 100.0
+    assert list(early.with_sections(CLOSED_AT_700).closing) == [2]
+    assert early.with_sections(OPEN.sections).sorting_m[0] == 400.0
+    vehicle = StreamVehicle("a", (10, 1), 0)  # at 150 m
+    assert StreamPlanner(early).plan(0, [vehicle]).paths["a"][1] == (10, 1)
+    plan = StreamPlanner(early).plan(0, [vehicle], sections=CLOSED_AT_700)
+    assert plan.paths["a"][1][1] == 0
 
 
 @pytest.mark.slow

@@ -1,0 +1,54 @@
+"""Message about parts of lanes that are closed for a time."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from laneweave.protocol.names import Name
+from laneweave.protocol.road_layout import TemporaryClosure
+from laneweave.protocol.wire.field_types import Int64, Message, Real
+
+BREAKDOWN: Final = "breakdown"
+CLOSED: Final = "closed"
+
+
+class Obstacle(Message, frozen=True):
+    """Part of a lane that is closed for a time; part of `Obstacles`."""
+
+    lane: Int64
+    from_m: Real
+    """Where it begins [m]."""
+    to_m: Real
+    """Where the lane is open again [m]."""
+    late_m: Real = 0.0
+    """Length of the queue of vehicles that cannot stop at the stop line, before the part [m]."""
+    cause: str = CLOSED
+    """`breakdown`: a vehicle has broken down; `closed`: an event of the road, or an operator."""
+    since_s: Real = 0.0
+    """Road time at which the lane was closed."""
+    until_s: Real | None = None
+    """Road time at which the cause ends; None: not known. Until nobody waits there any more, the
+    part stays closed."""
+    vehicle: Name = Name("")
+    """The vehicle that has broken down."""
+
+
+class Obstacles(Message, frozen=True):
+    """Bridge to coordinators, agents and observers: the parts of lanes that are closed for a time.
+
+    Sent with each census, from the first part on. Missing: the receiver uses the older one. Motion
+    controllers know all parts, so a move into a closed part does not begin, and a vehicle that
+    brakes for a part that is open again is only late. Duplicated or older than the newest: ignored.
+    """
+
+    t_s: Real
+    parts: tuple[Obstacle, ...] = ()
+    bridge: Int64 = 0
+    """Incarnation of the bridge [ns]; 0: not given."""
+
+    @property
+    def closed(self) -> tuple[TemporaryClosure, ...]:
+        """The parts, as lane ends are derived from them."""
+        return tuple(
+            TemporaryClosure(one.lane, one.from_m, one.to_m, one.late_m) for one in self.parts
+        )

@@ -1,0 +1,287 @@
+"""Parts of lanes that are closed for a time.
+
+A part is closed around a vehicle that has broken down, or for an event of the scenario. Its
+beginning is a dead end (`LaneEnds`): vehicles change lanes before it, or stop before it and
+re-enter the lattice.
+
+A part stays closed until its cause is over and no vehicle waits there any more. Vehicles that wait
+then start in their own lane, which nobody else uses.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+
+from attrs import define, frozen
+
+from laneweave.protocol.road_layout import LanePosition, TemporaryClosure
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.vehicle.lane_ends import LaneEnds, re_entry
+from laneweave.protocol.vehicle.sudden_stops import begins_m, room_before_part_m, stops_before
+from laneweave.protocol.wire.messages import Name
+from laneweave.protocol.wire.obstacle_messages import BREAKDOWN, CLOSED, Obstacle
+from laneweave.sim_bridge.bodies.stop_lines import STANDING_MPS
+from laneweave.sim_bridge.road.vehicle import RoadVehicle
+
+AHEAD_M = 1.0
+"""How far a closed part reaches beyond the front of a vehicle that has broken down."""
+NOBODY = Name("")
+SPARE_M = 5.0
+"""Room for vehicles that do not stop as close to each other as they could."""
+BEFORE_END_M = 0.1
+"""Distance before the end of a section at which closed parts in it end at the latest."""
+
+
+@frozen
+class Breakdown:
+    """A vehicle that breaks down: it slows down in its lane, and stands there."""
+
+    at_s: float
+    """Road time from which it may break down; a vehicle that moves or settles ends that first."""
+    vehicle: Name | None = None
+    """Its name; None: one that fits the following fields."""
+    lane: int | None = None
+    """None: any lane."""
+    at_m: float | None = None
+    """The vehicle is the first one beyond this position; None: it is drawn."""
+    draw: float = 0.0
+    """Number from 0 to below 1 that selects one of all possible vehicles."""
+    decel_mps2: float = 3.0
+    for_s: float = math.inf
+    """Time for which it stands; infinite: for ever."""
+
+
+@frozen
+class Closure:
+    """A part of a lane that is closed without a vehicle in it."""
+
+    at_s: float
+    part: TemporaryClosure
+    until_s: float = math.inf
+
+
+@define
+class ActiveObstacle:
+    """A part of a lane that is closed now."""
+
+    kind: str
+    """`BREAKDOWN` or `CLOSED`."""
+    part: TemporaryClosure
+    since_s: float
+    until_s: float = math.inf
+    """When the cause is over; infinite: not known."""
+    breakdown: Breakdown | None = None
+    vehicle: Name = NOBODY
+    """The vehicle that has broken down, if any."""
+    stands: bool = False
+    """Whether it has stopped."""
+
+    def is_over(self, t_s: float) -> bool:
+        """Return whether the cause of the obstacle is over."""
+        return t_s >= self.until_s
+
+    @property
+    def begins_at(self) -> LanePosition:
+        """Lane and position at which the part begins; they identify its dead end."""
+        return self.part[:2]
+
+    @property
+    def message(self) -> Obstacle:
+        """The obstacle as it is published."""
+        until_s = None if math.isinf(self.until_s) else self.until_s
+        return Obstacle(*self.part, self.kind, self.since_s, until_s, self.vehicle)
+
+
+class Obstacles:
+    """All obstacles of a road."""
+
+    def __init__(self, scenario: Scenario, breakdowns: Iterable[Breakdown] = ()) -> None:
+        """Begin with the events of the scenario, and with breakdowns that are to happen."""
+        self._scenario = scenario
+        self._always = LaneEnds(scenario)
+        self._queue_m = scenario.types.longest_body_m + scenario.tracking.min_gap_m
+        """Distance between the fronts of vehicles that stand in a queue."""
+        self._pending: list[Breakdown | Closure] = [
+            Closure(one.at_s, TemporaryClosure(one.lane, one.from_m, one.to_m), one.until_s)
+            for one in scenario.road.events
+        ]
+        self._pending += breakdowns
+        self.active: list[ActiveObstacle] = []
+
+    def __bool__(self) -> bool:
+        """Return whether there are obstacles, or will be."""
+        return bool(self._pending or self.active)
+
+    @property
+    def closed(self) -> tuple[TemporaryClosure, ...]:
+        """The parts of lanes that are closed now."""
+        return tuple(one.part for one in self.active)
+
+    def without_vehicles(self, t_s: float) -> list[TemporaryClosure]:
+        """Return the parts in which no vehicle may be."""
+        return [one.part for one in self.active if one.kind == CLOSED and not one.is_over(t_s)]
+
+    def over(self, t_s: float) -> frozenset[LanePosition]:
+        """Return where those begin whose cause is over, although vehicles still wait there.
+
+        While another part that is still closed is so near ahead that a vehicle that has started
+        would pass its stop line before it is in its cell, vehicles wait for that one, too.
+        """
+        closed = [one.part for one in self.active if not one.is_over(t_s)]
+        settles_m = re_entry(self._scenario).distance_m if self.active else 0.0
+
+        def is_free(part: TemporaryClosure) -> bool:
+            return not any(
+                other.lane == part.lane
+                and other.to_m > part.from_m
+                and self._line_m(other) < part.to_m + settles_m
+                for other in closed
+            )
+
+        return frozenset(
+            one.begins_at for one in self.active if one.is_over(t_s) and is_free(one.part)
+        )
+
+    def update(
+        self, vehicles: Mapping[Name, RoadVehicle], t_s: float, in_use: Collection[LanePosition]
+    ) -> Iterator[RoadVehicle]:
+        """Begin and end obstacles; yield the vehicles that break down now.
+
+        Args:
+            vehicles: the vehicles on the road.
+            t_s: road time.
+            in_use: dead ends at which vehicles wait, or from which they re-enter.
+        """
+        for one in list(self.active):
+            self._follow(one, vehicles, t_s)
+            if one.is_over(t_s) and one.begins_at not in in_use:
+                self.active.remove(one)
+        for cause in [one for one in self._pending if t_s >= one.at_s]:
+            if isinstance(cause, Closure):
+                inside, near = self.in_the_way(cause.part, vehicles)
+                if inside or near:
+                    continue
+                self._pending.remove(cause)
+                if t_s < cause.until_s:
+                    part = self._with_room(cause.part, vehicles)
+                    obstacle = ActiveObstacle(CLOSED, part, t_s, cause.until_s)
+                    self.active.append(obstacle)
+            elif (vehicle := self._found(cause, vehicles, t_s)) is not None:
+                self._pending.remove(cause)
+                others = {name: one for name, one in vehicles.items() if one is not vehicle}
+                part = self._with_room(self._part_of(vehicle, cause.decel_mps2), others)
+                obstacle = ActiveObstacle(
+                    BREAKDOWN, part, t_s, breakdown=cause, vehicle=vehicle.name
+                )
+                self.active.append(obstacle)
+                vehicle.controller.broken_mps2 = cause.decel_mps2
+                yield vehicle
+
+    def in_the_way(
+        self, part: TemporaryClosure, vehicles: Mapping[Name, RoadVehicle]
+    ) -> tuple[int, int]:
+        """Return how many vehicles are in a part, and how many more cannot stop before it."""
+        lane, from_m, to_m, _ = part
+        inside = near = 0
+        for vehicle in vehicles.values():
+            s_m, speed_mps = vehicle.state[:2]
+            if lane not in vehicle.lanes_touched or s_m - vehicle.size[0] >= to_m:
+                continue
+            inside += s_m >= from_m
+            near += s_m < from_m and not stops_before(from_m, s_m, speed_mps)
+        return inside, near
+
+    def _follow(
+        self, one: ActiveObstacle, vehicles: Mapping[Name, RoadVehicle], t_s: float
+    ) -> None:
+        """Note that a vehicle that breaks down has stopped, or has left the road."""
+        vehicle = vehicles.get(one.vehicle)
+        if one.breakdown is None or one.stands:
+            return
+        if vehicle is None:
+            one.until_s = t_s
+        elif vehicle.state[1] < STANDING_MPS:
+            one.stands, one.until_s = True, t_s + one.breakdown.for_s
+            to_m = self._end_m(one.part.lane, vehicle.state[0])
+            one.part = one.part._replace(to_m=to_m)
+
+    def _part_of(self, vehicle: RoadVehicle, decel_mps2: float) -> TemporaryClosure:
+        """Return the part of a lane that a vehicle blocks while it slows down.
+
+        It begins where the front is now, or where the rear will be if the vehicle brakes in less
+        than its length, and ends before vehicles ahead; once it stands, in front of it.
+        """
+        s_m, speed_mps = vehicle.state[:2]
+        lane, brakes_m = vehicle.cell[1], speed_mps**2 / (2.0 * decel_mps2)
+        from_m = s_m + min(0.0, brakes_m - vehicle.size[0])
+        return TemporaryClosure(lane, from_m, self._end_m(lane, s_m))
+
+    def _with_room(
+        self, part: TemporaryClosure, vehicles: Mapping[Name, RoadVehicle]
+    ) -> TemporaryClosure:
+        """Return a part with room for the vehicles that cannot stop at the stop line before it.
+
+        They stop before the part, and those at the line have room to start all the same.
+        """
+        late, most_m = 0, self._room_ahead_m(part.lane, part.from_m)
+        behind = [
+            vehicle.state[:2]
+            for vehicle in vehicles.values()
+            if part.lane in vehicle.lanes_touched and vehicle.state[0] < part.from_m
+        ]
+        while True:
+            late_m = min(late * self._queue_m + (SPARE_M if late else 0.0), most_m)
+            with_room = part._replace(late_m=late_m)
+            found = sum(not stops_before(self._line_m(with_room), *each) for each in behind)
+            if found <= late:
+                return with_room
+            late = found
+
+    def _line_m(self, part: TemporaryClosure) -> float:
+        """Return the stop line before a part."""
+        return part.from_m - re_entry(self._scenario).room_m - part.late_m
+
+    def _room_ahead_m(self, lane: int, from_m: float) -> float:
+        """Return the room that vehicles that enter the lane do not need to stop before a part.
+
+        Negative: they could not.
+        """
+        needed_m = room_before_part_m(self._scenario, re_entry(self._scenario).room_m)
+        return from_m - needed_m - begins_m(self._scenario, lane, from_m)
+
+    def _end_m(self, lane: int, front_m: float) -> float:
+        """Return where a part ends in front of a vehicle: before the end of its section."""
+        sections = self._scenario.geometry.sections
+        ends_m = [each.to_m for each in sections if each.lane == lane]
+        end_m = min((each for each in ends_m if each > front_m), default=max(ends_m))
+        return min(front_m + AHEAD_M, end_m - BEFORE_END_M)
+
+    def _found(
+        self, breakdown: Breakdown, vehicles: Mapping[Name, RoadVehicle], t_s: float
+    ) -> RoadVehicle | None:
+        """Return the vehicle that breaks down now: one that is settled in its cell.
+
+        Those behind it can stop, and it will stand before the stop line of its lane.
+        """
+        possible: Sequence[RoadVehicle] = [
+            vehicle
+            for vehicle in vehicles.values()
+            if breakdown.vehicle in (None, vehicle.name)
+            and breakdown.lane in (None, vehicle.cell[1])
+            and (breakdown.at_m is None or vehicle.state[0] >= breakdown.at_m)
+            and vehicle.controller.off_lattice is None
+            and vehicle.controller.broken_mps2 is None
+            and vehicle.controller.has_settled(t_s)
+            and self._may_stand(vehicle, breakdown.decel_mps2)
+        ]
+        if breakdown.at_m is not None:
+            return min(possible, key=lambda vehicle: vehicle.state[0], default=None)
+        return possible[int(breakdown.draw * len(possible))] if possible else None
+
+    def _may_stand(self, vehicle: RoadVehicle, decel_mps2: float) -> bool:
+        s_m, speed_mps = vehicle.state[:2]
+        lane, brakes_m = vehicle.cell[1], speed_mps**2 / (2.0 * decel_mps2)
+        end = self._always.ahead(lane, s_m)
+        stands_m = s_m + brakes_m + vehicle.size[0]
+        return self._room_ahead_m(lane, s_m) >= 0.0 and (end is None or stands_m < end.line_m)

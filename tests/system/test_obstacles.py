@@ -1,0 +1,136 @@
+"""Vehicles that break down and lanes that are closed while vehicles drive: whole runs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import laneweave
+from laneweave.protocol.summary import RunSummary
+from laneweave.protocol.wire.events import (
+    ENTERED,
+    LEFT_LATTICE,
+    PART_CLOSED,
+    PART_OPENED,
+    STREAM_PLANNED,
+)
+from support.harness import Lab, check_safe_and_complete, events, summary
+
+ROAD = {
+    "road": {"s1_m": 50.0, "s2_m": 100.0, "s3_m": 750.0},
+    "demand": {"volume_veh_per_lane_h": 1000.0, "duration_s": 80.0},
+    "formation": {"operation": "rolling"},
+    "tracking": {"shortcut": True},
+    "seed": 3,
+}
+BREAKDOWN = {"at_s": 45.0, "lane": 1, "at_m": 500.0, "for_s": 30.0}
+EVENT = {"lane": 1, "from_m": 550.0, "to_m": 600.0, "at_s": 15.0, "until_s": 45.0}
+
+
+def run(out: Path, faults: dict[str, Any] | None = None, **overrides: object) -> RunSummary:
+    scenario = laneweave.load_scenario(ROAD, **overrides)
+    found = laneweave.run(scenario, out=out, transport="simulated", faults=faults)
+    assert found.safety.overlaps == 0
+    return found
+
+
+@pytest.mark.parametrize(
+    "loss", [0.0, pytest.param(0.3, marks=pytest.mark.more)], ids=["", "30 % loss"]
+)
+def test_the_others_drive_around_a_vehicle_that_breaks_down(tmp_path: Path, loss: float) -> None:
+    faults: dict[str, Any] = {"breakdown": [BREAKDOWN]}
+    if loss:
+        faults["messages"] = [{"loss": loss}]
+    found = run(tmp_path / "run", faults)
+    assert found.vehicles.left == found.vehicles.demanded
+    assert found.obstacles is not None
+    (obstacle,) = found.obstacles
+    assert (obstacle.cause, obstacle.lane) == ("breakdown", 1)
+    assert obstacle.opened_s is not None
+    assert obstacle.opened_s >= obstacle.since_s + 30.0
+    assert obstacle.vehicle
+    # Those that have room to plan for drive around it.
+    entered_s = {event["vehicle"]: event["t_s"] for event in events(tmp_path / "run", ENTERED)}
+    stopped = {event["vehicle"] for event in events(tmp_path / "run", LEFT_LATTICE)}
+    assert len(stopped) == obstacle.stopped + 1
+    late = [name for name in stopped if entered_s[name] > obstacle.since_s]
+    assert len(late) <= 2 < len(entered_s) - len(late)
+    kinds = [event["kind"] for event in events(tmp_path / "run", PART_CLOSED)]
+    assert len(kinds) == 2  # known better once the vehicle stands
+    assert len(events(tmp_path / "run", PART_OPENED)) == 1
+
+
+def test_the_road_is_planned_anew_within_two_seconds(tmp_path: Path) -> None:
+    run(tmp_path / "run", {"breakdown": [BREAKDOWN]})
+    closed_s = events(tmp_path / "run", PART_CLOSED)[0]["t_s"]
+    planned_s = [event["t_s"] for event in events(tmp_path / "run", STREAM_PLANNED)]
+    assert min(t_s - closed_s for t_s in planned_s if t_s >= closed_s) <= 2.0
+
+
+def test_a_part_that_is_closed_ahead_stops_nobody_and_is_used_again(tmp_path: Path) -> None:
+    found = run(tmp_path / "run", road__events=(EVENT,))
+    assert found.obstacles is not None
+    (obstacle,) = found.obstacles
+    assert (obstacle.cause, obstacle.stopped, obstacle.opened_s) == ("closed", 0, 45.0)
+    recorded = laneweave.load_run(tmp_path / "run").trajectories().to_pydict()
+    in_part = [
+        t_s
+        for t_s, s_m, lane in zip(*(recorded[key] for key in ("t_s", "s_m", "lane")), strict=True)
+        if lane == 1 and 550.0 < s_m < 600.0 and t_s > obstacle.since_s
+    ]
+    assert 45.0 <= min(in_part) <= 55.0
+
+
+def test_equal_seeds_give_equal_runs(tmp_path: Path) -> None:
+    faults = {"breakdown": [{"at_s": 20.0, "count": 2, "for_s": 10.0}]}
+    first, second = (run(tmp_path / name, faults) for name in ("a", "b"))
+    assert first.obstacles == second.obstacles
+    assert first.travel_time_s == second.travel_time_s
+
+
+def test_vehicles_that_do_not_break_down_are_a_failure(lab: Lab) -> None:
+    road = lab.path("road.toml", "[demand]\nvolume_veh_per_lane_h = 600\nduration_s = 10\n")
+    faults = lab.path("faults.toml", "[[breakdown]]\nat_s = 20\nlane = 1\nat_m = 2000\n")
+    ended = lab.run(
+        "run", road, "--faults", faults, "--transport", "simulated", "--out", lab.folder / "run"
+    )
+    assert ended.status == 1
+    assert "breakdown: only 0 of 1 vehicles that fit were on the road" in " ".join(
+        ended.out.split()
+    )
+
+
+@pytest.mark.parametrize("operation", ["rolling", "formations"])
+@pytest.mark.more
+def test_with_processes_when_the_leader_is_killed_at_the_same_time(
+    lab: Lab, operation: str
+) -> None:
+    text = f"""seed = 4
+[road]
+s1_m = 50.0
+s2_m = 100.0
+s3_m = 600.0
+[demand]
+volume_veh_per_lane_h = 1000.0
+duration_s = 40.0
+[formation]
+operation = "{operation}"
+[runtime]
+vehicles_per_process = 1
+"""
+    road = lab.path("road.toml", text)
+    faults = lab.path(
+        "faults.toml",
+        "[[breakdown]]\nat_s = 25\nlane = 1\nat_m = 250\nfor_s = 20\n"
+        '[[kill]]\ntarget = "leader"\nat_s = 25\n',
+    )
+    folder = lab.folder / "run"
+    ended = lab.run("run", road, "--faults", faults, "--out", folder)
+    assert (ended.status, ended.complaints) == (0, []), ended
+    check_safe_and_complete(folder)
+    found = summary(folder)
+    assert found["vehicles"]["left"] == found["vehicles"]["demanded"]
+    (obstacle,) = found["obstacles"]
+    assert obstacle["opened_s"] >= obstacle["since_s"] + 20.0
