@@ -312,9 +312,12 @@ class EntryMeter:
             self._count_in(column)
 
     def _count_in(self, column: int) -> None:
-        self._in_column[column] = self._in_column.get(column, 0) + 1
-        while len(self._in_column) > _MAX_KEEPING_COLUMNS:
-            del self._in_column[next(iter(self._in_column))]
+        at_start = zip(self._columns, self._entry_m, strict=True)
+        next_one = max(next_one for next_one, entry_m in at_start if entry_m <= 0.0)
+        counts = self._in_column
+        # Columns ahead of those that vehicles can enter are forgotten.
+        self._in_column = {each: count for each, count in counts.items() if each <= next_one}
+        self._in_column[column] = counts.get(column, 0) + 1
 
     def exit_cells(self, arrival: Arrival, column: int) -> tuple[Cell, ...]:
         """Return the cells for leaving by lanes in which a ramp follows the exit.
