@@ -60,9 +60,10 @@ def test_the_others_drive_around_a_vehicle_that_breaks_down(tmp_path: Path, loss
     kinds = [event["kind"] for event in events(tmp_path / "run", PART_CLOSED)]
     assert len(kinds) == 2  # known better once the vehicle stands
     assert len(events(tmp_path / "run", PART_OPENED)) == 1
-    # The road is planned anew within two seconds.
-    planned_s = [event["t_s"] for event in events(tmp_path / "run", STREAM_PLANNED)]
-    assert min(t_s for t_s in planned_s if t_s >= obstacle.since_s) <= obstacle.since_s + 2.0
+    if not loss:  # otherwise the event may be lost
+        # The road is planned anew within two seconds.
+        planned_s = [event["t_s"] for event in events(tmp_path / "run", STREAM_PLANNED)]
+        assert min(t_s for t_s in planned_s if t_s >= obstacle.since_s) <= obstacle.since_s + 2.0
 
 
 def test_a_part_that_is_closed_ahead_stops_nobody_and_is_used_again(tmp_path: Path) -> None:
