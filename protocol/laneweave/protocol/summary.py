@@ -227,7 +227,7 @@ class LeaderChanges:
 class ObstacleFigures:
     """A part of a lane that was closed for a time."""
 
-    cause: str = figure("breakdown: of a vehicle; closed: by an event of the road or an operator")
+    cause: str = figure("breakdown: of a vehicle; closed: by an event of the road")
     lane: int = figure("lane; 0 is the rightmost")
     from_m: float = figure("beginning of the part", "m")
     to_m: float = figure("end of the part", "m")

@@ -63,7 +63,7 @@ TRACKING_SHARE = 0.9
 """Share of the time before a body touches the other lane by which a move may begin early; the rest
 is kept for tracking errors."""
 HEEDED_BRAKING_MPS2 = 8.0
-"""Deceleration with which a vehicle that brakes for such a part must still be able to stop."""
+"""Deceleration up to which a vehicle brakes for a part of a lane that is closed suddenly."""
 NEAR_LINE_M = 1.0
 """Distance past a line at which a vehicle still stands at it."""
 CLEAR_M = 1.0

@@ -23,7 +23,7 @@ class Obstacle(Message, frozen=True):
     late_m: Real = 0.0
     """Length of the queue of vehicles that cannot stop at the stop line, before the part [m]."""
     cause: str = CLOSED
-    """`breakdown`: a vehicle has broken down; `closed`: an event of the road, or an operator."""
+    """`breakdown`: a vehicle has broken down; `closed`: an event of the road."""
     since_s: Real = 0.0
     """Road time at which the lane was closed."""
     until_s: Real | None = None

@@ -162,8 +162,7 @@ class LaneEndControl:
                 yield LaneEndChange(name, MISSED_EXIT, controller.hold_cell[1])
             elif (missed and self._cells_stay_free) or controller.has_lost_cell(t_s):
                 # While it re-enters, a vehicle may come to another dead end.
-                self._forget(name)
-                yield self._take_off(name, vehicle)
+                yield self.take_off(name, vehicle)
         for at, gaps in self._gaps.items():
             startable = self._startable(at, vehicles)
             if startable:
@@ -222,9 +221,6 @@ class LaneEndControl:
     def take_off(self, name: Name, vehicle: RoadVehicle) -> LaneEndChange:
         """Take a vehicle off the lattice that has broken down, or whose lane ends."""
         self._forget(name)
-        return self._take_off(name, vehicle)
-
-    def _take_off(self, name: Name, vehicle: RoadVehicle) -> LaneEndChange:
         vehicle.controller.leave_lattice()
         lane, s_m = vehicle.controller.hold_cell[1], vehicle.state[0]
         ends = [(at, end) for at, end in self._ends.items() if end.lane == lane]
