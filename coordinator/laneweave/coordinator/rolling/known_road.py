@@ -23,6 +23,7 @@ from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.formation_table import READY_LATE_S
 from laneweave.protocol.vehicle.lane_ends import sections_to_lines
 from laneweave.protocol.vehicle.motion import DISPLACED_ALONG_M
+from laneweave.protocol.vehicle.sudden_stops import queue_pitch_m
 from laneweave.protocol.wire.messages import CensusEntry, Name, VehicleState
 
 LOOKAHEAD_M = 600.0
@@ -127,7 +128,7 @@ class KnownRoad:
         """
         scenario, begins_m = self.scenario, section.to_m
         lattice, states = scenario.lattice, self.snapshot.states
-        queue_m = scenario.types.longest_body_m + scenario.tracking.min_gap_m
+        queue_m = queue_pitch_m(scenario)
         cells = (
             states[entry.vehicle].hold_cell if entry.vehicle in states else entry.cell
             for entry in self.snapshot.census.on_lattice

@@ -21,6 +21,11 @@ def stopping_m(speed_mps: float) -> float:
     return speed * REACTION_S + speed * speed / (2.0 * BRAKING_MPS2)
 
 
+def queue_pitch_m(scenario: Scenario) -> float:
+    """Return the distance between the fronts of vehicles that stand in a queue."""
+    return scenario.types.longest_body_m + scenario.tracking.min_gap_m
+
+
 def room_before_part_m(scenario: Scenario, room_m: float) -> float:
     """Return how far behind the beginning of its section a part of a lane may be closed suddenly.
 

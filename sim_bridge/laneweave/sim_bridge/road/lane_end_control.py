@@ -29,6 +29,7 @@ from laneweave.protocol.vehicle.lane_ends import (
     own_re_entry,
     re_entry,
 )
+from laneweave.protocol.vehicle.sudden_stops import queue_pitch_m
 from laneweave.protocol.vehicle.territory import territory_of
 from laneweave.protocol.wire.events import DRIVES_OUT, ENTERED_LATTICE, LEFT_LATTICE, MISSED_EXIT
 from laneweave.protocol.wire.messages import Name, OffLattice
@@ -78,8 +79,7 @@ class LaneEndControl:
         self._cells_stay_free = territory_of(scenario).given_up_cells_stay_free
         self._scenario = scenario
         self._lattice = scenario.lattice
-        self._queue_m = scenario.types.longest_body_m + scenario.tracking.min_gap_m
-        """Distance between the fronts of vehicles that stand in a queue."""
+        self._queue_m = queue_pitch_m(scenario)
         self._any = False
         self._ends: dict[LanePosition, LaneEnd] = {}
         """Dead ends by lane and end; those that have vanished as long as vehicles wait there."""

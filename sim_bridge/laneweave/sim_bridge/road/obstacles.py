@@ -18,7 +18,12 @@ from attrs import define, frozen
 from laneweave.protocol.road_layout import LanePosition, TemporaryClosure
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.lane_ends import LaneEnds, re_entry
-from laneweave.protocol.vehicle.sudden_stops import begins_m, room_before_part_m, stops_before
+from laneweave.protocol.vehicle.sudden_stops import (
+    begins_m,
+    queue_pitch_m,
+    room_before_part_m,
+    stops_before,
+)
 from laneweave.protocol.wire.messages import Name
 from laneweave.protocol.wire.obstacle_messages import BREAKDOWN, CLOSED, Obstacle
 from laneweave.sim_bridge.bodies.stop_lines import STANDING_MPS
@@ -100,8 +105,7 @@ class Obstacles:
         """Begin with the events of the scenario, and with breakdowns that are to happen."""
         self._scenario = scenario
         self._always = LaneEnds(scenario)
-        self._queue_m = scenario.types.longest_body_m + scenario.tracking.min_gap_m
-        """Distance between the fronts of vehicles that stand in a queue."""
+        self._queue_m = queue_pitch_m(scenario)
         self._pending: list[Breakdown | Closure] = [
             Closure(one.at_s, TemporaryClosure(one.lane, one.from_m, one.to_m), one.until_s)
             for one in scenario.road.events
