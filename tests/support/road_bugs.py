@@ -13,8 +13,9 @@ from laneweave.agents.core import AgentCore
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.road_layout import Exits, TemporaryClosure
 from laneweave.protocol.scenario.vehicle_types import VehicleTypes
-from laneweave.protocol.vehicle.lane_ends import LaneEnd, LaneEnds, ReEntry
+from laneweave.protocol.vehicle.lane_ends import LaneEnd, LaneEnds
 from laneweave.protocol.vehicle.plan_execution import PlanExecution
+from laneweave.protocol.vehicle.re_entry import ReEntry
 from laneweave.protocol.wire.messages import Census, CensusEntry, Command, Name, Sense
 from laneweave.sim_bridge.bodies import motion_controller
 from laneweave.sim_bridge.bodies.motion_controller import MotionController, OffLatticePhase
@@ -31,6 +32,7 @@ from laneweave.sim_bridge.road.lane_end_control import LaneEndControl
 from laneweave.sim_bridge.road.obstacles import Obstacles
 from laneweave.sim_bridge.road.roadside import EntranceRoom, Roadside
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
+from laneweave.sim_bridge.road.vehicles_in_part import VehiclesInPart
 from support.bugs import Bug, breaks
 from support.states import set_record
 
@@ -238,9 +240,9 @@ def broken_vehicles_drive_on(*_: object) -> tuple[float, float]:
 
 
 @breaks(OBSTACLES, Obstacles, "in_the_way")
-def parts_are_closed_around_vehicles(*_: object) -> tuple[int, int]:
+def parts_are_closed_around_vehicles(*_: object) -> VehiclesInPart:
     """A part is closed while vehicles are in it."""
-    return 0, 0
+    return VehiclesInPart((), (), ())
 
 
 @breaks(OBSTACLES, LaneEndControl, "_is_over")

@@ -19,14 +19,14 @@ to be newer was wrong.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 from msgspec.structs import replace
 
 from laneweave.agents.driving.driver import Driver, SolverStats, TrackingDriver
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell, PlannedMove, stretch_of
-from laneweave.protocol.road_layout import TemporaryClosure
+from laneweave.protocol.road_layout import NO_PARTS, TemporaryParts
 from laneweave.protocol.runtime.node import (
     Announce,
     Arrived,
@@ -131,7 +131,7 @@ class AgentCore:
         self._driver = make_driver(scenario, scenario.vehicle)
         self._drivable: frozenset[Cell] | None = None
         self._lane_ends, self._territory = LaneEnds(scenario), territory_of(scenario)
-        self._closed: tuple[TemporaryClosure, ...] = ()
+        self._temporary = NO_PARTS
         self._rules = rules
         self.wanted_motions: tuple[int, ...] = ()
         """Stretches of columns whose motions are needed now; empty while not in charge."""
@@ -199,12 +199,12 @@ class AgentCore:
         if execution.needs_states(sense.t_s):
             self.wanted_states = execution.plan.blocks
 
-    def on_obstacles(self, closed: Sequence[TemporaryClosure]) -> None:
-        """Handle the parts of lanes that are closed now."""
-        if tuple(closed) == self._closed:
+    def on_obstacles(self, temporary: TemporaryParts) -> None:
+        """Handle the parts of lanes that are not open as always."""
+        if temporary == self._temporary:
             return
-        self._closed = tuple(closed)
-        self._lane_ends = LaneEnds(self._scenario, self._closed)
+        self._temporary = temporary
+        self._lane_ends = LaneEnds(self._scenario, temporary)
         self._driver.close(self._lane_ends)
         if self.execution is not None:
             self.execution.lane_ends = self._lane_ends
@@ -301,8 +301,8 @@ class AgentCore:
         if self._begun is None:
             return True
         (_, origin, target), _ = self._begun
-        # Before a part that is closed suddenly, the motion controller refuses a whole move.
-        slot_s = execution.plan.slot_s if self._closed and execution.plan is not None else None
+        # The motion controller refuses a whole move into a part that is closed or cleared.
+        slot_s = execution.plan.slot_s if self._temporary and execution.plan is not None else None
         late = self._lane_ends.too_late(origin, target, sense.t_s, slot_s)
         return sense.hold_cell != origin or late
 

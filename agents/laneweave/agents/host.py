@@ -9,6 +9,7 @@ from attrs import frozen
 
 from laneweave.agents.core import AgentCore
 from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.road_layout import NO_PARTS
 from laneweave.protocol.runtime.metrics import MetricsSnapshot, metric
 from laneweave.protocol.runtime.node import (
     Arrived,
@@ -220,7 +221,7 @@ class AgentHost:
         effects: list[Effect] = []
         self._obstacles = None
         for agent in self._agents.values():
-            agent.on_obstacles(())
+            agent.on_obstacles(NO_PARTS)
         if self._shard is not None:
             for name in list(self._agents):
                 effects += self._remove(name).leave()
@@ -255,7 +256,7 @@ class AgentHost:
         self._left.pop(name, None)
         self._agents[name] = self._make_agent(name)
         if self._obstacles is not None:
-            self._agents[name].on_obstacles(self._obstacles.closed)
+            self._agents[name].on_obstacles(self._obstacles.temporary)
         return list(self._agents[name].handle(Started(), now_s))
 
     def _on_obstacles(self, message: Obstacles, now_s: float) -> None:
@@ -267,7 +268,7 @@ class AgentHost:
         if newest is None or message.bridge != newest.bridge or message.t_s >= newest.t_s:
             self._obstacles = message
             for agent in self._agents.values():
-                agent.on_obstacles(message.closed)
+                agent.on_obstacles(message.temporary)
 
     def _on_census(self, census: Census, now_s: float) -> list[Effect]:
         effects: list[Effect] = []

@@ -331,7 +331,7 @@ class CoordinatorCore:
             case Obstacles():
                 if message.t_s >= self._obstacles_s:
                     self._obstacles_s = message.t_s
-                    self.operation.on_obstacles(message.closed)
+                    self.operation.on_obstacles(message.temporary)
             case Census():
                 if self.census is None or message.t_s >= self.census.t_s:
                     self.census = message

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import Any, Protocol
 
 from attrs import field, frozen
 
-from laneweave.protocol.road_layout import TemporaryClosure
+from laneweave.protocol.road_layout import TemporaryParts
 from laneweave.protocol.runtime.node import Compute, Computed, Effect, Send
 from laneweave.protocol.wire.messages import Census, Name, Plan, Prepare, VehicleState
 from laneweave.protocol.wire.topics import PLAN, PREPARE
@@ -36,8 +36,8 @@ class Operation(Protocol):
     def on_clock(self, t_s: float, now_s: float) -> None:
         """Handle a road clock message, even while not leading."""
 
-    def on_obstacles(self, closed: Sequence[TemporaryClosure]) -> None:
-        """Handle the parts of lanes that are closed now, even while not leading."""
+    def on_obstacles(self, temporary: TemporaryParts) -> None:
+        """Handle the parts of lanes that are not open as always, even while not leading."""
 
     def on_state(self, state: VehicleState, now_s: float) -> list[LogEntry] | None:
         """Handle the state of a vehicle on the road; return None if nothing depends on it."""

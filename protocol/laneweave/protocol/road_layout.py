@@ -41,6 +41,38 @@ class TemporaryClosure(NamedTuple):
     """Length of the queue of vehicles that could not stop at the stop line, before the part."""
 
 
+class ClearedPart(NamedTuple):
+    """A part of a lane that vehicles leave, and that none may enter; it may move."""
+
+    lane: int
+    from_m: float
+    """Where it begins at road time `at_s` [m]."""
+    to_m: float
+    speed_mps: float = 0.0
+    at_s: float = 0.0
+
+    def at(self, t_s: float) -> tuple[float, float]:
+        """Return where it begins and ends at a road time [m]."""
+        moved_m = self.speed_mps * (t_s - self.at_s)
+        return self.from_m + moved_m, self.to_m + moved_m
+
+
+@frozen
+class TemporaryParts:
+    """Parts of lanes that are not open as always."""
+
+    closed: tuple[TemporaryClosure, ...] = ()
+    """They begin with a dead end: vehicles stop before them."""
+    cleared: tuple[ClearedPart, ...] = ()
+
+    def __bool__(self) -> bool:
+        """Return whether there are any."""
+        return bool(self.closed or self.cleared)
+
+
+NO_PARTS = TemporaryParts()
+
+
 @frozen
 class LaneSection:
     """A part of a lane that is open from one position to another [m]."""

@@ -227,15 +227,19 @@ class LeaderChanges:
 class ObstacleFigures:
     """A part of a lane that was closed for a time."""
 
-    cause: str = figure("breakdown: of a vehicle; closed: by an event of the road")
+    cause: str = figure(
+        "breakdown: of a vehicle; closed: by an event of the road or an operator; passing: a "
+        "vehicle of another system"
+    )
     lane: int = figure("lane; 0 is the rightmost")
-    from_m: float = figure("beginning of the part", "m")
+    from_m: float = figure("beginning of the part, or where a passing vehicle entered", "m")
     to_m: float = figure("end of the part", "m")
-    vehicle: str = figure("vehicle that broke down; empty: none")
+    vehicle: str = figure("vehicle that broke down or passed; empty: none")
     since_s: float = figure("road time at which the part was closed", "s")
     opened_s: float | None = optional("road time from which it was open again", "s")
     stopped: int = figure("vehicles that left the lattice in its lane meanwhile", default=0)
     waited_s: float = figure("sum of the times until they were in cells again", "s", default=0.0)
+    lowest_speed_mps: float | None = optional("lowest speed of a passing vehicle", "m/s")
 
 
 @frozen(kw_only=True)

@@ -36,6 +36,7 @@ from laneweave.protocol.runtime.node import (
 from laneweave.protocol.scenario.deployment_fields import Runtime
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.summary import Ending
+from laneweave.protocol.vehicle.motion import State
 from laneweave.protocol.wire.events import AGENT_MISSING
 from laneweave.protocol.wire.messages import Command, Heartbeat, Name, Plan, Prepare
 from laneweave.protocol.wire.process_messages import LogEvent, Report, RoadStatus
@@ -187,6 +188,8 @@ class BridgeCore:
         self._tick_began = 0.0
         self._deployment = Deployment(scenario, incarnation, record)
         self._agent_log = AgentLog(self._deployment.fleet_of)
+        self._passing: set[Name] = set()
+        """Vehicles of other systems in the world."""
         self._opened_s = self._census_s = 0.0
         """When the current tick was opened; when the census is published next if it waits."""
         self._ending = Ending.COMPLETE
@@ -387,8 +390,12 @@ class BridgeCore:
         road = self.road
         self._record.on_missed(self._answers.close())
         road.step()
-        closed = self._roadside.obstacles.without_vehicles(road.t_s)
-        show_bodies(self._world, road.vehicles, self._scenario, self._record, road.t_s, closed)
+        obstacles = self._roadside.obstacles
+        closed, passing = obstacles.without_vehicles(road.t_s), obstacles.passing
+        self._show_passing(passing.states)
+        show_bodies(
+            self._world, road.vehicles, self._scenario, self._record, road.t_s, closed, passing
+        )
         for vehicle in road.departed():
             self._world.remove(vehicle.name)
             self._departures.append((road.tick, vehicle.name))
@@ -404,6 +411,14 @@ class BridgeCore:
         answering = not self._answers.all_silent and road.caretakers.link_up
         self._until_s = self._pace.next_s(now_s, answering=answering)
         self.phase = TickPhase.PACE
+
+    def _show_passing(self, states: Mapping[Name, State]) -> None:
+        """Add vehicles of other systems to the world, and remove those that have left."""
+        for name in self._passing - states.keys():
+            self._world.remove(name)
+        for name in states.keys() - self._passing:
+            self._world.add(name, states[name])
+        self._passing = {*states}
 
     def _is_over(self) -> bool:
         if self._roadside.is_over(self.t_s, self.vehicles):

@@ -10,12 +10,14 @@ from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.motion import State
 from laneweave.protocol.wire.messages import CAR, Name
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import (
+    NO_SIZES,
     ExactNeighbour,
     ExactNeighbours,
     OtherBody,
     Pose,
 )
 from laneweave.sim_bridge.recording.record_interface import Record
+from laneweave.sim_bridge.road.passing_vehicles import PassingVehicles
 from laneweave.sim_bridge.road.sized_bodies import bodies_of
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
 
@@ -55,17 +57,23 @@ def show_bodies(
     record: Record,
     t_s: float,
     closed: Iterable[TemporaryClosure] = (),
+    passing: PassingVehicles | None = None,
 ) -> None:
     """Display all bodies after a tick, record their poses and update all sensors.
 
-    `t_s` is the road time after the tick; `closed` are parts of lanes in which no body may be now.
+    `t_s` is the road time after the tick; `closed` are parts of lanes in which no body may be now,
+    `passing` vehicles of other systems.
     """
     states = {name: vehicle.state for name, vehicle in vehicles.items()}
+    if passing:
+        states |= passing.states
     for name, state in states.items():
         world.place(name, state)
     world.step()
     road = scenario.road
-    bodies = bodies_of(world.positions(), (one.arrival for one in vehicles.values()), scenario)
+    sizes = passing.sizes if passing else NO_SIZES
+    arrivals = (one.arrival for one in vehicles.values())
+    bodies = bodies_of(world.positions(), arrivals, scenario, sizes)
     accels_mps2: dict[str, float] = {name: state[2] for name, state in states.items()}
     neighbours = bodies.exact_neighbours(road.lanes, road.lane_width_m, accels_mps2)
     touching = []

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 
 from laneweave.coordinator.ballots.ballot_round import PROMISED, TIME, BallotPhase
 from laneweave.coordinator.formations.formation_planner import FormationPlanner
@@ -11,7 +11,7 @@ from laneweave.coordinator.formations.leader import FormationLeader
 from laneweave.coordinator.formations.roster import Formation, Groups, closed_formations, joinable
 from laneweave.coordinator.operation import LogEntry, to_vehicle
 from laneweave.coordinator.planning.response import PlanFunction
-from laneweave.protocol.road_layout import TemporaryClosure
+from laneweave.protocol.road_layout import TemporaryParts
 from laneweave.protocol.runtime.node import Compute, Computed, Effect
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.state_machine import RuleBook
@@ -67,8 +67,8 @@ class FormationsOperation:
         self.leaders.clear()
         self._planner.forget()
 
-    def on_obstacles(self, closed: Sequence[TemporaryClosure]) -> None:
-        """Ignore closed parts: formations do not drive around them."""
+    def on_obstacles(self, temporary: TemporaryParts) -> None:
+        """Ignore them: formations do not drive around parts of lanes."""
 
     def on_clock(self, t_s: float, now_s: float) -> None:
         """Measure the ratio of road time to the node's clock."""

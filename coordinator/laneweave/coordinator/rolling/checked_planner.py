@@ -10,7 +10,7 @@ from attrs import evolve
 from laneweave.coordinator.planning.conflict_kinds import ConflictModel
 from laneweave.coordinator.planning.kernels import ROLLING
 from laneweave.coordinator.planning.rolling.problem import (
-    Sections,
+    OpenRoad,
     StreamCosts,
     StreamPlan,
     StreamRoad,
@@ -28,10 +28,10 @@ REWARD = -0.5
 
 
 Planner = Callable[
-    [int, Sequence[StreamVehicle], StreamPlan | None, Collection[Cell], Sections | None],
+    [int, Sequence[StreamVehicle], StreamPlan | None, Collection[Cell], OpenRoad | None],
     StreamPlan,
 ]
-"""Function of slot, vehicles, previous plan, blocked cells and sections that are open now.
+"""Function of slot, vehicles, previous plan, blocked cells, and what of the road is open now.
 
 It returns paths for all vehicles from that slot on; `StreamPlanner.plan` except in fault searches
 and tests."""
@@ -52,10 +52,10 @@ def _checked_plan(
     vehicles: Sequence[StreamVehicle],
     before: StreamPlan | None,
     blocked: Collection[Cell],
-    sections: Sections | None,
+    now: OpenRoad | None,
 ) -> StreamPlan:
-    table = planner(slot, vehicles, before, blocked, sections)
-    problems = problems_of_plan(road.with_sections(sections), table, vehicles, blocked)
+    table = planner(slot, vehicles, before, blocked, now)
+    problems = problems_of_plan(road.as_open(now), table, vehicles, blocked)
     if problems:
         raise ValueError(f"the plan of slot {slot} is invalid: {'; '.join(problems)}")
     return table

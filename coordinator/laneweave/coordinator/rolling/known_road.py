@@ -13,12 +13,20 @@ from collections.abc import Sequence
 from attrs import evolve, frozen
 
 from laneweave.coordinator.ballots.ballot_round import BallotPhase
-from laneweave.coordinator.planning.rolling.problem import Sections, StreamVehicle
+from laneweave.coordinator.planning.rolling.problem import MovingPart, OpenRoad, StreamVehicle
 from laneweave.coordinator.rolling.observed import Snapshot
 from laneweave.coordinator.rolling.ownership import certain_cells
 from laneweave.coordinator.rolling.transfer import CellTransfer
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.road_layout import ANY_LANE, END_OF_ROAD, LaneSection, TemporaryClosure
+from laneweave.protocol.road_layout import (
+    ANY_LANE,
+    END_OF_ROAD,
+    NO_PARTS,
+    ClearedPart,
+    LaneSection,
+    TemporaryClosure,
+    TemporaryParts,
+)
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.formation_table import READY_LATE_S
 from laneweave.protocol.vehicle.lane_ends import sections_to_lines
@@ -87,7 +95,19 @@ class KnownRoad:
         )
         return tuple(vehicles.values()), blocked
 
-    def open_sections(self, closed: Sequence[TemporaryClosure] = ()) -> Sections:
+    def open_road(self, temporary: TemporaryParts = NO_PARTS) -> OpenRoad:
+        """Return the road as plans may use it now."""
+        return OpenRoad(
+            tuple(self._open_sections(temporary.closed)),
+            tuple(self._moving_part(one) for one in temporary.cleared),
+        )
+
+    def _moving_part(self, part: ClearedPart) -> MovingPart:
+        """Return a part that is cleared as the planner takes it."""
+        advance_m = part.speed_mps * self._slot_s
+        return MovingPart(part.lane, *part.at(0.0), advance_m)
+
+    def _open_sections(self, closed: Sequence[TemporaryClosure]) -> list[LaneSection]:
         """Return the sections as plans may use them now.
 
         They end before parts that are closed for a time, and before vehicles without cells or
@@ -118,7 +138,7 @@ class KnownRoad:
             if number >= always:
                 queue_m = self._queue_begins_m(sections[number])
                 sections[number] = evolve(sections[number], to_m=queue_m)
-        return tuple(sections)
+        return sections
 
     def _queue_begins_m(self, section: LaneSection) -> float:
         """Return where moves out of a section end that is closed suddenly.

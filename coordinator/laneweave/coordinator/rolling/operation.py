@@ -10,7 +10,7 @@ starts from its cell.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from typing import Any
 
@@ -24,7 +24,7 @@ from laneweave.coordinator.rolling.observed import ObservedRoad
 from laneweave.coordinator.rolling.ownership import certain_cells, partners
 from laneweave.coordinator.rolling.transfer import TRANSFER_RULES, CellTransfer
 from laneweave.protocol.lattice import footprint
-from laneweave.protocol.road_layout import TemporaryClosure
+from laneweave.protocol.road_layout import NO_PARTS, TemporaryParts
 from laneweave.protocol.runtime.node import Clock, Compute, Computed, Effect
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.formation_table import SNAPSHOT_S
@@ -91,8 +91,8 @@ class RollingOperation:
         """Id of the computation in progress, and index of the slot that it plans."""
         self._newest_slot = -1
         self._last_plan: StreamPlan | None = None
-        self._closed: tuple[TemporaryClosure, ...] = ()
-        self._closed_changed = False
+        self._temporary = NO_PARTS
+        self._parts_changed = False
         """Whether these parts have changed since the last plan."""
 
     def forget(self) -> None:
@@ -100,7 +100,7 @@ class RollingOperation:
         self.take_over()
         self.observed.forget()
         self._last_plan, self._newest_slot = None, -1
-        self._closed, self._closed_changed = (), False
+        self._temporary, self._parts_changed = NO_PARTS, False
 
     def take_over(self) -> None:
         """Reset: listen for `LISTEN_S` before planning, and drop the ballots of the earlier term.
@@ -115,10 +115,10 @@ class RollingOperation:
     def on_clock(self, t_s: float, now_s: float) -> None:
         """Ignore the clock message: only road time determines when plans are due."""
 
-    def on_obstacles(self, closed: Sequence[TemporaryClosure]) -> None:
-        """Handle the parts of lanes that are closed now."""
-        if tuple(closed) != self._closed:
-            self._closed, self._closed_changed = tuple(closed), True
+    def on_obstacles(self, temporary: TemporaryParts) -> None:
+        """Handle the parts of lanes that are not open as always."""
+        if temporary != self._temporary:
+            self._temporary, self._parts_changed = temporary, True
 
     def on_state(self, state: VehicleState, now_s: float) -> list[LogEntry] | None:
         """Handle the state of a vehicle; return None if no unfinished ballot depends on it."""
@@ -181,7 +181,7 @@ class RollingOperation:
             return
         slot = math.floor(t_s / self._slot_s + 1e-9)
         snapshot_s = slot * self._slot_s + SNAPSHOT_S + 1e-6
-        if self._closed_changed and t_s < self._newest_slot * self._slot_s - AGAIN_S:
+        if self._parts_changed and t_s < self._newest_slot * self._slot_s - AGAIN_S:
             self._newest_slot = slot
         if slot < self._newest_slot or t_s <= snapshot_s or now_s < self._since[1] + LISTEN_S:
             return
@@ -190,7 +190,7 @@ class RollingOperation:
         known = KnownRoad(
             self._scenario, self.observed.at(snapshot_s), snapshot_s, slot + 1, self._since[0]
         )
-        self._closed_changed = False
+        self._parts_changed = False
         vehicles, blocked = known.vehicles_and_blocked_cells(self.transfers)
         self._newest_slot = slot + 1
         job = self._new_job()
@@ -201,7 +201,7 @@ class RollingOperation:
             vehicles,
             self._last_plan,
             blocked,
-            known.open_sections(self._closed),
+            known.open_road(self._temporary),
         )
         yield Compute(job, partial(_without_deadline, plan))
 

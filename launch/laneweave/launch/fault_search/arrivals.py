@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Collection, Sequence
 
-from laneweave.coordinator.planning.rolling.problem import Sections, StreamPlan, StreamVehicle
+from laneweave.coordinator.planning.rolling.problem import OpenRoad, StreamPlan, StreamVehicle
 from laneweave.coordinator.rolling.checked_planner import Planner
 from laneweave.launch.fault_search.checks.checker import Checker
 from laneweave.launch.fault_search.road.light_road import LightRoad
@@ -75,9 +75,9 @@ class Arrivals:
             vehicles: Sequence[StreamVehicle],
             before: StreamPlan | None,
             blocked: Collection[Cell],
-            sections: Sections | None,
+            now: OpenRoad | None,
         ) -> StreamPlan:
-            table = planner(slot, vehicles, before, blocked, sections)
+            table = planner(slot, vehicles, before, blocked, now)
             if self.healed:
                 self._planned_slots += 1
                 paths = table.paths.items()

@@ -16,6 +16,7 @@ from laneweave.protocol.scenario.road_tables import (
     MAIN_ENTRANCE,
     Entrance,
     LaneRule,
+    RoadEvent,
     SolidLine,
     TypeShare,
 )
@@ -27,8 +28,8 @@ from laneweave.protocol.vehicle.lane_ends import (
     exit_lanes,
     first_step_m,
     lane_beside,
-    re_entry,
 )
+from laneweave.protocol.vehicle.re_entry import re_entry
 from laneweave.protocol.vehicle.sudden_stops import begins_m, room_before_part_m
 from laneweave.protocol.wire.messages import CAR
 
@@ -36,8 +37,12 @@ ROUNDED_SHARE = 1e-3
 """Share of a type that may be due to the rounding of others: it needs no lane."""
 
 
+MAX_PASSING_M = 30.0
+"""Maximum length of vehicles of other systems."""
+
+
 def check_events(scenario: Scenario) -> None:
-    """Check that parts of lanes that are closed for a time are where these lanes are open."""
+    """Check parts of lanes that are closed for a time, and vehicles of other systems."""
     road = scenario.road
     for number, event in enumerate(road.events):
         name = f"road.events[{number}]"
@@ -47,29 +52,58 @@ def check_events(scenario: Scenario) -> None:
         require(event.to_m > event.from_m, f"{name}.to_m", event.to_m, allowed)
         allowed = f"more than at_s, {event.at_s:g}"
         require(event.until_s > event.at_s, f"{name}.until_s", event.until_s, allowed)
-        sections = [
-            (each, _last_m(scenario, each))
-            for each in scenario.geometry.sections
-            if each.lane == event.lane
-        ]
-        needed_m = room_before_part_m(scenario, re_entry(scenario).room_m)
-        least_m = begins_m(scenario, event.lane, event.from_m) + needed_m
-        places = " or ".join(
-            f"{one.from_m + needed_m:g} to {last_m:g} m" for one, last_m in sections
-        )
-        require(
-            event.from_m >= least_m
-            and any(one.from_m < event.from_m and event.to_m < last_m for one, last_m in sections),
-            f"{name}.from_m",
-            event.from_m,
-            f"a part within {places}, which vehicles that enter the lane can see in time",
-        )
+        if event.speed_mps:
+            _check_passage(scenario, name, event)
+        else:
+            check_part(scenario, f"{name}.", event.lane, event.from_m, event.to_m)
     require(
         not (road.events and scenario.sumo.config),
         "road.events",
         Described("a table"),
         "none in a corridor of a SUMO simulation",
     )
+
+
+def check_part(scenario: Scenario, name: str, lane: int, from_m: float, to_m: float) -> None:
+    """Check that a part of a lane may be closed suddenly.
+
+    Raises:
+        BadInputError: it may not; `name` is that of the table with the fields.
+    """
+    sections = [
+        (each, _last_m(scenario, each)) for each in scenario.geometry.sections if each.lane == lane
+    ]
+    needed_m = room_before_part_m(scenario, re_entry(scenario).room_m)
+    least_m = begins_m(scenario, lane, from_m) + needed_m
+    places = " or ".join(f"{one.from_m + needed_m:g} to {last_m:g} m" for one, last_m in sections)
+    require(
+        from_m >= least_m
+        and any(one.from_m < from_m and to_m < last_m for one, last_m in sections),
+        f"{name}from_m",
+        from_m,
+        f"a part within {places}, which vehicles that enter the lane can see in time",
+    )
+
+
+def _check_passage(scenario: Scenario, name: str, event: RoadEvent) -> None:
+    """Check a vehicle of another system: it drives in a lane that is open from end to end."""
+    road = scenario.road
+    lanes = [each.lane for each in scenario.geometry.sections if each.from_m <= 0.0]
+    lanes = [
+        lane for lane in lanes if sum(one.lane == lane for one in scenario.geometry.sections) == 1
+    ]
+    require(event.lane in lanes, f"{name}.lane", event.lane, f"a lane without ends: {lanes}")
+    length_m = event.to_m - event.from_m
+    require(
+        length_m <= MAX_PASSING_M,
+        f"{name}.to_m",
+        event.to_m,
+        f"at most {MAX_PASSING_M:g} m beyond from_m: the length of a vehicle",
+    )
+    if event.speed_mps < scenario.formation.speed_mps:
+        check_part(scenario, f"{name}.", event.lane, event.from_m, event.to_m)
+    else:
+        require(event.to_m < road.length_m, f"{name}.to_m", event.to_m, "a place on the road")
 
 
 def _last_m(scenario: Scenario, section: LaneSection) -> float:

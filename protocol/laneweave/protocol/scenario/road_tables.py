@@ -30,9 +30,11 @@ class Closure:
 
 @frozen
 class RoadEvent:
-    """A part of a lane that is closed for a time.
+    """A part of a lane that is closed for a time, or with a speed, a vehicle of another system.
 
-    It is closed as soon as no vehicle is in it, or so near that it could not stop before it.
+    A part is cleared first: vehicles leave it, and none enters it. It is closed as soon as no
+    vehicle is in it, or so near that it could not stop before it. A vehicle of another system
+    enters between `from_m` and `to_m` as soon as there is room, and stays in its lane.
     """
 
     lane: int = field(validator=within(0, 7))
@@ -42,6 +44,11 @@ class RoadEvent:
     """Road time from which it is closed."""
     until_s: float = field(default=math.inf, validator=within(0.0, math.inf))
     """Road time until which it is closed; by default, for ever."""
+    speed_mps: float = field(default=0.0, validator=within(0.0, 60.0))
+    """Speed of a vehicle of another system; 0: a closed part."""
+    clear_s: float = field(default=20.0, validator=within(0.0, 600.0))
+    """Time for which the lane is cleared at most, until nobody need brake hard for the part, or
+    for the vehicle that enters."""
 
 
 @frozen

@@ -42,11 +42,13 @@ class StopLinesAhead:
         return s_m if past is None or past.lane != lane else max(s_m, past.reopens_m)
 
     def allow(self, command: Command, t_s: float) -> bool:
-        """Return whether a move may begin in both its lanes, and ends before one of them does."""
+        """Return whether a move may begin: in time in both lanes, and into no cleared part."""
         ends, move = self.lane_ends, (command.motion.origin, command.hold_cell)
         takes_s = command.motion.end_tick * self._scenario.runtime.tick_s - t_s
         return not ends or (
-            ends.may_begin(*move, t_s) and not ends.reaches_line(*move, t_s, takes_s)
+            ends.may_begin(*move, t_s)
+            and not ends.reaches_line(*move, t_s, takes_s)
+            and not ends.enters_cleared(*move, t_s, takes_s)
         )
 
     def lines(

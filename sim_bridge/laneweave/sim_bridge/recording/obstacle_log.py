@@ -10,7 +10,7 @@ from laneweave.protocol.road_layout import LanePosition
 from laneweave.protocol.summary import ObstacleFigures
 from laneweave.protocol.wire.events import ENTERED_LATTICE, LEFT_LATTICE, PART_OPENED
 from laneweave.protocol.wire.messages import Name
-from laneweave.protocol.wire.obstacle_messages import Obstacle
+from laneweave.protocol.wire.obstacle_messages import PASSING, Obstacle
 
 
 @define
@@ -38,11 +38,13 @@ class ObstacleLog:
                     since_s=obstacle.since_s,
                 )
             )
-        opened_s = None
+        opened_s = lowest_mps = None
         if kind == PART_OPENED:
             del self._active[place]
             opened_s = round(t_s, 6)
-        self._change(number, to_m=obstacle.to_m, opened_s=opened_s)
+        if obstacle.cause == PASSING:
+            lowest_mps = round(obstacle.speed_mps, 3)
+        self._change(number, to_m=obstacle.to_m, opened_s=opened_s, lowest_speed_mps=lowest_mps)
 
     def on_lane_end(self, t_s: float, vehicle: Name, lane: int, kind: str) -> None:
         """Note that a vehicle has no cell any more, or has one again."""

@@ -17,7 +17,7 @@ from laneweave.protocol.wire.messages import (
     OffLattice,
     RoadClock,
 )
-from laneweave.protocol.wire.obstacle_messages import Obstacle, Obstacles
+from laneweave.protocol.wire.obstacle_messages import Cleared, Obstacle, Obstacles
 from laneweave.protocol.wire.topics import CENSUS, CLOCK, OBSTACLES
 from laneweave.sim_bridge.road.demand_queue import DemandQueue, OutsideTraffic, announcement_of
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
@@ -52,6 +52,8 @@ class CensusPublisher:
         self._sent_tick = -CENSUS_EVERY_TICKS
         self.obstacles: tuple[Obstacle, ...] = ()
         """Parts of lanes that are closed now."""
+        self.cleared: tuple[Cleared, ...] = ()
+        """Parts of lanes that are cleared now."""
         self._had_obstacles = False
         """Whether there have been any: messages may be lost, so that there are none is repeated."""
         self._changed = True
@@ -81,9 +83,10 @@ class CensusPublisher:
             self._changed = False
             self._sent_tick = tick
             yield Send(CENSUS, self.census(t_s, on_road))
-            self._had_obstacles |= bool(self.obstacles)
+            self._had_obstacles |= bool(self.obstacles or self.cleared)
             if self._had_obstacles:
-                yield Send(OBSTACLES, Obstacles(t_s, self.obstacles, self._bridge))
+                message = Obstacles(t_s, self.obstacles, self._bridge, self.cleared)
+                yield Send(OBSTACLES, message)
 
     def clock(self, tick: int, t_s: float, on_road: int, *, ended: bool = False) -> RoadClock:
         """Return the clock message of a tick, with counts of vehicles."""

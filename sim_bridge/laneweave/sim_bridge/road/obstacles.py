@@ -1,11 +1,12 @@
 """Parts of lanes that are closed for a time.
 
-A part is closed around a vehicle that has broken down, or for an event of the scenario. Its
-beginning is a dead end (`LaneEnds`): vehicles change lanes before it, or stop before it and
-re-enter the lattice.
+A part is closed around a vehicle that has broken down, for an event of the scenario, by an
+operator, or around a slow vehicle of another system. Its beginning is a dead end (`LaneEnds`):
+vehicles change lanes before it, or stop before it and re-enter the lattice.
 
-A part stays closed until its cause is over and no vehicle waits there any more. Vehicles that wait
-then start in their own lane, which nobody else uses.
+A part that is to be closed is cleared first, while vehicles are in it or could not stop before it:
+vehicles leave it, and none enters it. A part stays closed until its cause is over and no vehicle
+waits there any more. Vehicles that wait then start in their own lane, which nobody else uses.
 """
 
 from __future__ import annotations
@@ -15,9 +16,11 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 
 from attrs import define, frozen
 
-from laneweave.protocol.road_layout import LanePosition, TemporaryClosure
+from laneweave.protocol.road_layout import LanePosition, TemporaryClosure, TemporaryParts
 from laneweave.protocol.scenario.fields import Scenario
-from laneweave.protocol.vehicle.lane_ends import LaneEnds, re_entry
+from laneweave.protocol.scenario.road_tables import RoadEvent
+from laneweave.protocol.vehicle.lane_ends import LaneEnds
+from laneweave.protocol.vehicle.re_entry import re_entry
 from laneweave.protocol.vehicle.sudden_stops import (
     begins_m,
     queue_pitch_m,
@@ -25,9 +28,22 @@ from laneweave.protocol.vehicle.sudden_stops import (
     stops_before,
 )
 from laneweave.protocol.wire.messages import Name
-from laneweave.protocol.wire.obstacle_messages import BREAKDOWN, CLOSED, Obstacle
+from laneweave.protocol.wire.obstacle_messages import (
+    BREAKDOWN,
+    CLOSED,
+    PASSING,
+    Cleared,
+    Obstacle,
+)
+from laneweave.protocol.wire.obstacle_messages import Obstacles as ObstaclesMessage
 from laneweave.sim_bridge.bodies.stop_lines import STANDING_MPS
+from laneweave.sim_bridge.road.passing_vehicles import PassingVehicles
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
+from laneweave.sim_bridge.road.vehicles_in_part import (
+    VehiclesInPart,
+    cleared_before_m,
+    vehicles_in_part,
+)
 
 AHEAD_M = 1.0
 """How far a closed part reaches beyond the front of a vehicle that has broken down."""
@@ -57,28 +73,19 @@ class Breakdown:
     """Time for which it stands; infinite: for ever."""
 
 
-@frozen
-class Closure:
-    """A part of a lane that is closed without a vehicle in it."""
-
-    at_s: float
-    part: TemporaryClosure
-    until_s: float = math.inf
-
-
 @define
 class ActiveObstacle:
     """A part of a lane that is closed now."""
 
     kind: str
-    """`BREAKDOWN` or `CLOSED`."""
+    """`BREAKDOWN`, `CLOSED` or `PASSING`."""
     part: TemporaryClosure
     since_s: float
     until_s: float = math.inf
     """When the cause is over; infinite: not known."""
     breakdown: Breakdown | None = None
     vehicle: Name = NOBODY
-    """The vehicle that has broken down, if any."""
+    """The vehicle that has broken down or is passing, if any."""
     stands: bool = False
     """Whether it has stopped."""
 
@@ -106,21 +113,46 @@ class Obstacles:
         self._scenario = scenario
         self._always = LaneEnds(scenario)
         self._queue_m = queue_pitch_m(scenario)
-        self._pending: list[Breakdown | Closure] = [
-            Closure(one.at_s, TemporaryClosure(one.lane, one.from_m, one.to_m), one.until_s)
-            for one in scenario.road.events
-        ]
+        events = scenario.road.events
+        self._pending: list[Breakdown | RoadEvent] = [one for one in events if not one.speed_mps]
         self._pending += breakdowns
+        self.passing = PassingVehicles(scenario, [one for one in events if one.speed_mps])
         self.active: list[ActiveObstacle] = []
+        self._clearing: list[RoadEvent] = []
 
     def __bool__(self) -> bool:
         """Return whether there are obstacles, or will be."""
-        return bool(self._pending or self.active)
+        return bool(self._pending or self.active or self.passing)
 
     @property
     def closed(self) -> tuple[TemporaryClosure, ...]:
         """The parts of lanes that are closed now."""
         return tuple(one.part for one in self.active)
+
+    @property
+    def parts(self) -> tuple[Obstacle, ...]:
+        """The same, as they are published."""
+        return tuple(one.message for one in self.active)
+
+    @property
+    def cleared(self) -> tuple[Cleared, ...]:
+        """The parts of lanes that are cleared now, as they are published."""
+        before_m = cleared_before_m(self._scenario) if self._clearing else 0.0
+        clearing = (
+            Cleared(one.lane, one.from_m - before_m, one.to_m, 0.0, one.at_s)
+            for one in self._clearing
+        )
+        return *self.passing.cleared, *clearing
+
+    @property
+    def temporary(self) -> TemporaryParts:
+        """The parts of lanes that are not open as always."""
+        return ObstaclesMessage(0.0, self.parts, cleared=self.cleared).temporary
+
+    @property
+    def at_rest(self) -> tuple[Obstacle, ...]:
+        """The closed parts without those around vehicles of other systems."""
+        return tuple(one.message for one in self.active if one.kind != PASSING)
 
     def without_vehicles(self, t_s: float) -> list[TemporaryClosure]:
         """Return the parts in which no vehicle may be."""
@@ -161,16 +193,21 @@ class Obstacles:
             self._follow(one, vehicles, t_s)
             if one.is_over(t_s) and one.begins_at not in in_use:
                 self.active.remove(one)
+        self.passing.update(vehicles, t_s)
+        self._follow_passing(vehicles, t_s)
+        self._clearing = []
         for cause in [one for one in self._pending if t_s >= one.at_s]:
-            if isinstance(cause, Closure):
-                inside, near = self.in_the_way(cause.part, vehicles)
-                if inside or near:
-                    continue
-                self._pending.remove(cause)
-                if t_s < cause.until_s:
-                    part = self._with_room(cause.part, vehicles)
-                    obstacle = ActiveObstacle(CLOSED, part, t_s, cause.until_s)
-                    self.active.append(obstacle)
+            if isinstance(cause, RoadEvent):
+                waits = t_s < cause.at_s + cause.clear_s
+                part = TemporaryClosure(cause.lane, cause.from_m, cause.to_m)
+                if t_s >= cause.until_s:
+                    self._pending.remove(cause)
+                elif self.in_the_way(part, vehicles).allow_closing(waits=waits):
+                    self._pending.remove(cause)
+                    part = self._with_room(part, vehicles)
+                    self.active.append(ActiveObstacle(CLOSED, part, t_s, cause.until_s))
+                else:
+                    self._clearing.append(cause)
             elif (vehicle := self._found(cause, vehicles, t_s)) is not None:
                 self._pending.remove(cause)
                 others = {name: one for name, one in vehicles.items() if one is not vehicle}
@@ -184,17 +221,23 @@ class Obstacles:
 
     def in_the_way(
         self, part: TemporaryClosure, vehicles: Mapping[Name, RoadVehicle]
-    ) -> tuple[int, int]:
-        """Return how many vehicles are in a part, and how many more cannot stop before it."""
-        lane, from_m, to_m, _ = part
-        inside = near = 0
-        for vehicle in vehicles.values():
-            s_m, speed_mps = vehicle.state[:2]
-            if lane not in vehicle.lanes_touched or s_m - vehicle.size[0] >= to_m:
-                continue
-            inside += s_m >= from_m
-            near += s_m < from_m and not stops_before(from_m, s_m, speed_mps)
-        return inside, near
+    ) -> VehiclesInPart:
+        """Return the vehicles in the way of a part that is to be closed."""
+        return vehicles_in_part(self._scenario, *part[:3], vehicles.values())
+
+    def _follow_passing(self, vehicles: Mapping[Name, RoadVehicle], t_s: float) -> None:
+        """Close the parts in which slow vehicles of other systems are now; end earlier ones."""
+        current = {one.name: one.closed for one in self.passing.on_road if one.closed is not None}
+        for one in self.active:
+            part = current.get(one.vehicle)
+            if one.kind == PASSING and one.until_s == math.inf:
+                if part is not None and part[:3] == one.part[:3]:
+                    del current[one.vehicle]
+                else:
+                    one.until_s = t_s
+        for name, part in current.items():
+            with_room = self._with_room(part, vehicles)
+            self.active.append(ActiveObstacle(PASSING, with_room, t_s, vehicle=name))
 
     def _follow(
         self, one: ActiveObstacle, vehicles: Mapping[Name, RoadVehicle], t_s: float
@@ -232,7 +275,7 @@ class Obstacles:
         behind = [
             vehicle.state[:2]
             for vehicle in vehicles.values()
-            if part.lane in vehicle.lanes_touched and vehicle.state[0] < part.from_m
+            if part.lane in vehicle.lanes_used and vehicle.state[0] < part.from_m
         ]
         while True:
             late_m = min(late * self._queue_m + (SPARE_M if late else 0.0), most_m)

@@ -7,7 +7,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.road_layout import TemporaryClosure, cut
+from laneweave.protocol.road_layout import NO_PARTS, TemporaryClosure, TemporaryParts, cut
 from laneweave.protocol.runtime.node import Effect
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.emergency_brake import EmergencyBrake
@@ -22,6 +22,7 @@ from laneweave.sim_bridge.road.demand_queue import NO_OUTSIDE_TRAFFIC, DemandQue
 from laneweave.sim_bridge.road.entry import Admission, EntryMeter, Goals
 from laneweave.sim_bridge.road.lane_end_control import LaneEndChange, LaneEndControl
 from laneweave.sim_bridge.road.obstacles import Breakdown, Obstacles
+from laneweave.sim_bridge.road.passing_vehicles import PassingVehicle
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
 
 QUEUE_ROOM_M = 20.0
@@ -66,7 +67,6 @@ class EntranceRoom:
         A ramp is full, too, while a queue at its end leaves no room for merging.
         """
         lattice = self._lattice
-        entering = (0.0, lattice.speed_mps, 0.0, 0.0, 0.0, 0.0)
         full = set[int]()
         for vehicle in vehicles:
             s_m, speed_mps, accel_mps2, y_m, _, _ = vehicle.state
@@ -87,12 +87,41 @@ class EntranceRoom:
                     continue
                 if beyond_m > self._room_m:
                     continue
-                body = Neighbour(0, beyond_m - length_m, speed_mps, accel_mps2)
-                spare_m = self._brake.spare_m(entering, 0.0, (0.0, 0.0), [body])
-                slow = speed_mps < 0.5 * lattice.speed_mps
-                if spare_m < (QUEUE_ROOM_M if slow else 0.0):
+                if self._is_near(Neighbour(0, beyond_m - length_m, speed_mps, accel_mps2)):
                     full.add(number)
         return full
+
+    def closed_points(
+        self, passing: Iterable[PassingVehicle], temporary: TemporaryParts, t_s: float
+    ) -> set[int]:
+        """Return the entry points that are closed to vehicles.
+
+        A vehicle of another system is near ahead, or the lane is cleared there.
+
+        Args:
+            passing: vehicles of other systems on the road.
+            temporary: parts of lanes that are not open as always.
+            t_s: road time.
+        """
+        cleared = [(one.lane, *one.at(t_s)) for one in temporary.cleared]
+        return {
+            number
+            for number, lane, at_m, _ in self._points
+            if any(lane == own and from_m <= at_m <= to_m for own, from_m, to_m in cleared)
+            or any(
+                lane == one.passage.lane
+                and 0.0 <= one.s_m - at_m <= self._room_m
+                and self._is_near(Neighbour(0, one.rear_m - at_m, one.speed_mps, one.accel_mps2))
+                for one in passing
+            )
+        }
+
+    def _is_near(self, body: Neighbour) -> bool:
+        """Return whether a body leaves too little room for a vehicle that enters behind it."""
+        speed_mps = self._lattice.speed_mps
+        entering = (0.0, speed_mps, 0.0, 0.0, 0.0, 0.0)
+        spare_m = self._brake.spare_m(entering, 0.0, (0.0, 0.0), [body])
+        return spare_m < (QUEUE_ROOM_M if body.speed_mps < 0.5 * speed_mps else 0.0)
 
 
 class Roadside:
@@ -133,7 +162,7 @@ class Roadside:
         self._lane_ends = LaneEndControl(scenario, self._meter)
         self._scenario = scenario
         self.obstacles = Obstacles(scenario, breakdowns)
-        self._closed: tuple[TemporaryClosure, ...] = ()
+        self._temporary = NO_PARTS
         self._told: tuple[Obstacle, ...] = ()
         """Obstacles of which events have been logged."""
         self.lane_ends = LaneEnds(scenario)
@@ -158,6 +187,8 @@ class Roadside:
         self._allocation.begin_tick(vehicles)
         self.demand.queue(t_s, (one.arrival for one in vehicles.values()))
         full = self._room.full_points(vehicles.values()) | self.outside.full_lanes(t_s)
+        if self.obstacles:
+            full |= self._room.closed_points(self.obstacles.passing.on_road, self._temporary, t_s)
         admissions = self._meter.admit(t_s, full)
         occupied = (one.controller.hold_cell for one in vehicles.values())
         admissions += self.outside.admit(t_s, self._meter, occupied)
@@ -184,23 +215,25 @@ class Roadside:
         """Close parts of lanes for a time, and open them again."""
         obstacles, control = self.obstacles, self._lane_ends
         broken = list(obstacles.update(vehicles, t_s, control.in_use))
-        if obstacles.closed != self._closed:
-            self._closed = obstacles.closed
-            self.lane_ends = LaneEnds(self._scenario, self._closed)
+        temporary = obstacles.temporary
+        if temporary != self._temporary:
+            self._temporary, closed = temporary, temporary.closed
+            self.lane_ends = LaneEnds(self._scenario, temporary)
             self.publisher.on_changed()
-            self._meter.most_in_column = self._lanes_past(self._closed)
+            self._meter.most_in_column = self._lanes_past(closed)
             for vehicle in vehicles.values():
                 vehicle.close(self.lane_ends)
-            control.close(self.lane_ends, self._closed)
+            control.close(self.lane_ends, closed)
         control.over = obstacles.over(t_s)
-        self.publisher.obstacles = tuple(one.message for one in obstacles.active)
+        self.publisher.obstacles, self.publisher.cleared = obstacles.parts, obstacles.cleared
         for vehicle in broken:
             yield control.take_off(vehicle.name, vehicle)
 
     def pop_obstacle_changes(self) -> Iterator[tuple[str, Obstacle]]:
         """Yield what has changed since the last call: kinds of events, and obstacles."""
-        before, self._told = self._told, self.publisher.obstacles
-        if self._told is not before:
+        yield from self.obstacles.passing.pop_changes()
+        before, self._told = self._told, self.obstacles.at_rest
+        if self._told != before:
             yield from ((PART_CLOSED, one) for one in self._told if one not in before)
             now = {(one.lane, one.from_m) for one in self._told}
             gone = (one for one in before if (one.lane, one.from_m) not in now)

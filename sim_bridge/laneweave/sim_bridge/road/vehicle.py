@@ -101,6 +101,11 @@ class RoadVehicle:
         return range(first, last + 1)
 
     @property
+    def lanes_used(self) -> set[int]:
+        """Lanes in which parts of the body are, or will be."""
+        return {*self.lanes_touched, self.cell[1]}
+
+    @property
     def keeps_lane(self) -> bool:
         """Whether the body is in its lane, and no plan in force leads it out of its cell."""
         return self.controller.keeps_lane

@@ -14,7 +14,7 @@ from msgspec.structs import replace
 
 from laneweave.coordinator.ballots.ballot_round import BallotPhase
 from laneweave.coordinator.operation import LogEntry
-from laneweave.coordinator.planning.rolling.problem import Sections, StreamPlan, StreamVehicle
+from laneweave.coordinator.planning.rolling.problem import OpenRoad, StreamPlan, StreamVehicle
 from laneweave.coordinator.rolling.checked_planner import checked, stream_planner, stream_road
 from laneweave.coordinator.rolling.known_road import LOOKAHEAD_M, MARGIN_COLUMNS
 from laneweave.coordinator.rolling.operation import (
@@ -27,11 +27,11 @@ from laneweave.coordinator.rolling.operation import (
 from laneweave.coordinator.rolling.transfer import CellTransfer
 from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.road_layout import TemporaryClosure
+from laneweave.protocol.road_layout import TemporaryClosure, TemporaryParts
 from laneweave.protocol.runtime.node import Compute, Computed
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.formation_table import READY_LATE_S, SNAPSHOT_S
-from laneweave.protocol.vehicle.lane_ends import re_entry
+from laneweave.protocol.vehicle.re_entry import re_entry
 from laneweave.protocol.wire.messages import (
     Ballot,
     Census,
@@ -87,7 +87,7 @@ class Call:
     vehicles: dict[str, StreamVehicle]
     before: StreamPlan | None
     blocked: frozenset[Cell]
-    sections: Sections | None
+    now: OpenRoad | None
 
 
 def place_m(state: State) -> float:
@@ -122,10 +122,10 @@ class Bench:
         vehicles: Iterable[StreamVehicle],
         before: StreamPlan | None = None,
         blocked: Iterable[Cell] = (),
-        sections: Sections | None = None,
+        now: OpenRoad | None = None,
     ) -> StreamPlan:
         asked = {vehicle.vehicle: vehicle for vehicle in vehicles}
-        self.calls.append(Call(slot, asked, before, frozenset(blocked), sections))
+        self.calls.append(Call(slot, asked, before, frozenset(blocked), now))
         return StreamPlan(slot, self.ways, self.missed)
 
     def new_job(self) -> int:
@@ -194,22 +194,22 @@ PART = TemporaryClosure(1, 600.0, 650.0)
 def test_a_slot_is_planned_again_when_a_part_of_a_lane_is_closed() -> None:
     desk = bench(A, B)
     desk.think()
-    desk.control.on_obstacles([PART])
+    desk.control.on_obstacles(TemporaryParts((PART,)))
     desk.think(LOOK_S + 1.0)
     assert [call.slot for call in desk.calls] == [SLOT + 1, SLOT + 1]
-    desk.control.on_obstacles([PART])  # repeated
+    desk.control.on_obstacles(TemporaryParts((PART,)))  # repeated
     assert desk.order(LOOK_S + 1.5) is None
 
 
 def test_a_slot_that_begins_soon_is_not_planned_again() -> None:
     desk = bench(A, B)
     desk.think()
-    desk.control.on_obstacles([PART])
+    desk.control.on_obstacles(TemporaryParts((PART,)))
     assert desk.order(BEGUN_S + SLOT_S - AGAIN_S + 0.1) is None
     call = desk.call(LOOK_S + SLOT_S)
     assert call.slot == SLOT + 2
-    assert call.sections is not None
-    assert len(call.sections) == 4
+    assert call.now is not None
+    assert len(call.now.sections) == 4
 
 
 def test_vehicles_in_force_are_left_alone_when_a_slot_is_planned_again() -> None:
@@ -217,7 +217,7 @@ def test_vehicles_in_force_are_left_alone_when_a_slot_is_planned_again() -> None
     desk.think()
     transfer = desk.transfer
     transfer.phase = BallotPhase.IN_FORCE
-    desk.control.on_obstacles([PART])
+    desk.control.on_obstacles(TemporaryParts((PART,)))
     call = desk.call(LOOK_S + 1.0)
     assert {name for name, one in call.vehicles.items() if one.waits} == set(transfer.roster)
     assert transfer in desk.control.transfers
@@ -229,9 +229,10 @@ def test_a_lane_that_is_closed_ends_before_the_queue_of_those_that_cannot_leave_
 ) -> None:
     """B is at 570 m when the slot begins, and needs 90 m to leave the lane."""
     desk = bench(A, B)
-    desk.control.on_obstacles([TemporaryClosure(1, from_m, from_m + 50.0)])
-    sections = desk.call().sections
-    assert sections is not None
+    desk.control.on_obstacles(TemporaryParts((TemporaryClosure(1, from_m, from_m + 50.0),)))
+    now = desk.call().now
+    assert now is not None
+    sections = now.sections
     queue_m = ROLLING.types.longest_body_m + ROLLING.tracking.min_gap_m
     line_m = from_m - re_entry(ROLLING).room_m
     (closing,) = sections[3:]
@@ -442,9 +443,9 @@ def test_vehicles_without_cells_are_not_planned_and_end_the_sections_they_are_in
     )
     desk.think()
     assert set(desk.calls[0].vehicles) == {A}
-    sections = desk.calls[0].sections
-    assert sections is not None
-    assert [section.to_m for section in sections] == [1000.0, 700.0, 1000.0]
+    now = desk.calls[0].now
+    assert now is not None
+    assert [section.to_m for section in now.sections] == [1000.0, 700.0, 1000.0]
 
 
 def test_states_may_arrive_in_any_order() -> None:

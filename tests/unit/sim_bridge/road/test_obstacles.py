@@ -8,9 +8,10 @@ from collections.abc import Callable
 import pytest
 from attrs import evolve
 
-from laneweave.protocol.road_layout import TemporaryClosure
+from laneweave.protocol.road_layout import TemporaryClosure, TemporaryParts
 from laneweave.protocol.scenario.road_tables import Closure, Demand, RoadEvent
-from laneweave.protocol.vehicle.lane_ends import LaneEnds, re_entry
+from laneweave.protocol.vehicle.lane_ends import LaneEnds
+from laneweave.protocol.vehicle.re_entry import re_entry
 from laneweave.protocol.vehicle.sudden_stops import room_before_part_m
 from laneweave.protocol.wire.events import (
     DRIVES_OUT,
@@ -23,7 +24,6 @@ from laneweave.protocol.wire.messages import Name
 from laneweave.protocol.wire.obstacle_messages import BREAKDOWN, CLOSED, Obstacle
 from laneweave.sim_bridge.bodies.stop_lines import STANDING_MPS
 from laneweave.sim_bridge.road.obstacles import ActiveObstacle, Breakdown
-from laneweave.sim_bridge.road.obstacles import Closure as Closed
 from support import road_bugs
 from support.bugs import Bug, catches
 from support.closed_lanes import LonelyRoad, road_with
@@ -192,10 +192,10 @@ def test_a_part_is_closed_only_once_nobody_is_in_it_or_could_not_stop_before_it(
     while road.t_s < 40.0:
         road.step()
     part = TemporaryClosure(LANE, 200.0, 350.0)
-    inside, near = road.roadside.obstacles.in_the_way(part, road.vehicles)
+    found = road.roadside.obstacles.in_the_way(part, road.vehicles)
     fronts_m = [one.state[0] for one in road.vehicles.values() if one.cell[1] == LANE]
-    assert inside == sum(200.0 <= front_m < 355.0 for front_m in fronts_m) > 0
-    assert near == sum(200.0 - 30.0 < front_m < 200.0 for front_m in fronts_m)
+    assert len(found.inside) == sum(200.0 <= front_m < 355.0 for front_m in fronts_m) > 0
+    assert len(found.near) == sum(200.0 - 30.0 < front_m < 200.0 for front_m in fronts_m)
 
 
 @pytest.mark.parametrize(
@@ -210,7 +210,9 @@ def test_a_part_is_closed_only_once_nobody_is_in_it_or_could_not_stop_before_it(
 def test_a_second_part_in_the_lane_or_beside_it_is_kept_free_too(
     second: tuple[int, float, float],
 ) -> None:
-    events = RoadEvent(1, 300.0, 350.0, 20.0, 60.0), RoadEvent(*second, 20.0, 150.0)
+    # Closed at once: vehicles that wait before the second part would keep the first one open.
+    first = RoadEvent(1, 300.0, 350.0, 20.0, 60.0, clear_s=0.0)
+    events = first, RoadEvent(*second, 20.0, 150.0, clear_s=0.0)
     assert len(run_to_end(lonely_road(events=events, volume=1000.0))) == 4
 
 
@@ -233,7 +235,7 @@ def test_a_single_vehicle_stops_before_a_part_that_is_closed_ahead_of_it(ahead_m
         road.step()
     vehicle = next(iter(road.vehicles.values()))
     from_m = vehicle.state[0] + ahead_m
-    closure = Closed(road.t_s, TemporaryClosure(vehicle.cell[1], from_m, from_m + 30.0))
+    closure = RoadEvent(vehicle.cell[1], from_m, from_m + 30.0, road.t_s, clear_s=0.0)
     road.roadside.obstacles._pending.append(closure)
     for _ in range(100):
         road.step()
@@ -328,10 +330,10 @@ def test_planted_bugs_are_noticed(bug: Bug, monkeypatch: pytest.MonkeyPatch) -> 
 
 def test_lane_ends_follow_from_closed_parts() -> None:
     part = TemporaryClosure(LANE, 600.0, 650.0, late_m=12.0)
-    (end,) = LaneEnds(ROAD, [part])
+    (end,) = LaneEnds(ROAD, TemporaryParts((part,)))
     assert (end.lane, end.end_m, end.reopens_m, end.sudden) == (LANE, 600.0, 650.0, True)
     assert end.line_m == end.stop_m == 600.0 - 12.0 - re_entry(ROAD).room_m
-    ends = LaneEnds(ROAD, [part])
+    ends = LaneEnds(ROAD, TemporaryParts((part,)))
     far = ends.heeded(LANE, end.line_m - 50.0, 15.0)
     late = ends.heeded(LANE, end.line_m - 5.0, 15.0)
     assert far == end

@@ -16,12 +16,21 @@ from attrs import evolve
 from numpy.typing import NDArray
 
 from laneweave.coordinator.planning.conflict_kinds import ConflictModel, conflict_offsets
+from laneweave.coordinator.planning.rolling.lane_rules import (
+    Bools,
+    Floats,
+    Ints,
+    LaneRules,
+    Singles,
+    Zones,
+    lane_rules,
+    zones,
+)
 from laneweave.coordinator.planning.rolling.paths_kernel import (
     ENTERING,
     FIXED,
     MAX_EJECTED,
     PENALTY,
-    UNREACHED,
 )
 from laneweave.coordinator.planning.rolling.problem import (
     ROUNDING_M,
@@ -35,11 +44,6 @@ _MAX_RESTRICTED_COST = 1000.0
 """Maximum cost of a path for driving where it may not, far below that of a forbidden move."""
 _SAVED = MAX_EJECTED + 32
 """Maximum number of paths saved during a chain or a reordering."""
-
-Ints = NDArray[np.int64]
-Floats = NDArray[np.float64]
-Singles = NDArray[np.float32]
-Bools = NDArray[np.bool_]
 
 
 class Table(NamedTuple):
@@ -167,34 +171,6 @@ class Window(NamedTuple):
     scratch: Scratch
 
 
-class _LaneRules(NamedTuple):
-    """Where vehicles may not drive or change lanes because of their type.
-
-    Types to which restrictions or solid lines apply form *groups*. Lane changes that are forbidden
-    are never planned. Driving on in a lane that is restricted ahead is not forbidden, since a
-    vehicle that has no room beside it must drive on; it only has a high cost.
-    """
-
-    group: Ints
-    """Group of each vehicle; 0: no rules apply to it."""
-    forbidden: Singles
-    """`Table.forbidden`."""
-    restricted: Bools
-    """Whether a vehicle that stays in a lane drives where it may not, in the slot that begins in a
-    cell; (groups - 1, slots + 1, lanes, columns)."""
-
-
-class _Zones(NamedTuple):
-    """Sections, divided where restrictions of groups begin and end."""
-
-    of_cell: NDArray[np.int16]
-    """`Table.zone`."""
-    section: Ints
-    """Section of each zone; -1: none."""
-    restricted: Bools
-    """Whether each zone is restricted for each group; (groups - 1, zones)."""
-
-
 def window(
     road: StreamRoad,
     costs: StreamCosts,
@@ -215,10 +191,11 @@ def window(
     slots += int(np.ceil(reach * road.pitch_m / road.advance_m))
     at_m = now_m + np.arange(slots + 1)[:, None] * road.advance_m
     starts_m = _starts_m(road, at_m[:-1])
-    rules = _lane_rules(road, vehicles, at_m, starts_m)
+    rules = lane_rules(road, vehicles, slot, at_m, starts_m)
     table, own_zones = _table(road, at_m, starts_m, low, blocked, rules)
     # A path must remain cheaper than one with a forbidden move.
-    costs = evolve(costs, restricted=min(costs.restricted, _MAX_RESTRICTED_COST / slots))
+    restricted = costs.cleared if road.cleared else costs.restricted
+    costs = evolve(costs, restricted=min(restricted, _MAX_RESTRICTED_COST / slots))
     return Window(
         low,
         table,
@@ -234,8 +211,8 @@ def _table(
     starts_m: Floats,
     low: int,
     blocked: Collection[Cell],
-    rules: _LaneRules,
-) -> tuple[Table, _Zones]:
+    rules: LaneRules,
+) -> tuple[Table, Zones]:
     """Return an empty table and its zones; `at_m`: positions of columns when slots begin."""
     slots, columns = at_m.shape[0] - 1, at_m.shape[1]
     offsets, first = _offsets(road.mode, road.model)
@@ -246,7 +223,7 @@ def _table(
     steps = displacements(road.mode)
     load = np.zeros((slots, len(steps), road.lanes, columns), dtype=np.float32)
     section, left, latest_m = _sections(road, at_m)
-    found = _zones(section, rules.restricted, len(road.sections))
+    found = zones(section, rules.restricted, len(road.sections))
     zone = found.of_cell
     may_move = _may_move(road, starts_m, latest_m, is_blocked)
     load[:, 1:][~may_move] = FIXED * ENTERING
@@ -273,42 +250,6 @@ def _table(
     return table, found
 
 
-def _lane_rules(
-    road: StreamRoad, vehicles: Sequence[StreamVehicle], at_m: Floats, starts_m: Floats
-) -> _LaneRules:
-    """Return the rules for vehicles; `at_m`: positions of columns at the beginning of slots."""
-    types = [one.vehicle_type for one in vehicles]
-    names = [name for name in sorted(set(types)) if road.rules_of(name)]
-    numbers = {name: number for number, name in enumerate(names, start=1)}
-    slots, columns = at_m.shape[0] - 1, at_m.shape[1]
-    steps = displacements(road.mode)
-    shape = (len(names), slots, len(steps), road.lanes, columns)
-    rules = _LaneRules(
-        np.array([numbers.get(name, 0) for name in types], dtype=np.int64),
-        np.zeros(shape, dtype=np.float32),
-        np.zeros((len(names), slots + 1, road.lanes, columns), dtype=np.bool_),
-    )
-    if not names:
-        return rules
-    for name, forbidden, restricted in zip(names, rules.forbidden, rules.restricted, strict=True):
-        for (lane, to_lane), from_m, to_m in road.forbidden_changes(name):
-            if not 0 <= min(lane, to_lane) <= max(lane, to_lane) < road.lanes:
-                continue
-            start_m = np.maximum(starts_m[:, lane], starts_m[:, to_lane])
-            for d, (column, side) in enumerate(steps):
-                if side == to_lane - lane:
-                    rear_m = start_m - road.body_m + min(0, column) * road.pitch_m
-                    front_m = start_m + road.advance_m + max(0, column) * road.pitch_m
-                    is_there = (rear_m < to_m - ROUNDING_M) & (front_m > from_m + ROUNDING_M)
-                    forbidden[:, d, lane][is_there] = UNREACHED
-        for one in road.restrictions:
-            if one.applies_to(name):
-                restricted[:, one.lane] |= (at_m - road.body_m < one.to_m - ROUNDING_M) & (
-                    at_m + road.advance_m > one.from_m + ROUNDING_M
-                )
-    return rules
-
-
 def _starts_m(road: StreamRoad, front_m: Floats) -> Floats:
     """Return `StreamRoad.start_m` for positions (slots, columns) of the front, for each lane.
 
@@ -322,30 +263,6 @@ def _starts_m(road: StreamRoad, front_m: Floats) -> Floats:
             later &= begins_m <= front_m + road.advance_m
             np.maximum(starts_m[:, lane], begins_m, out=starts_m[:, lane], where=later)
     return starts_m
-
-
-def _zones(section: NDArray[np.int16], restricted: Bools, sections: int) -> _Zones:
-    """Divide sections where restrictions begin and end.
-
-    Args:
-        section: section of each cell at the beginning of each slot; -1: none.
-        restricted: `_LaneRules.restricted`.
-        sections: number of sections.
-    """
-    groups = len(restricted)
-    if not groups:
-        numbers = np.array([*range(sections), -1], dtype=np.int64)
-        return _Zones(section, numbers, np.zeros((0, sections + 1), dtype=np.bool_))
-    code = section.astype(np.int64) + 1
-    for own in restricted:
-        code = 2 * code + own
-    codes, of_cell = np.unique(code, return_inverse=True)
-    bits = [(codes >> (groups - 1 - group)) & 1 for group in range(groups)]
-    return _Zones(
-        of_cell.reshape(section.shape).astype(np.int16),
-        (codes >> groups) - 1,
-        np.array(bits, dtype=np.bool_),
-    )
 
 
 def _sections(road: StreamRoad, at_m: Floats) -> tuple[NDArray[np.int16], Bools, Floats]:
@@ -409,8 +326,8 @@ def _paths(
     table: Table,
     low: int,
     vehicles: Sequence[StreamVehicle],
-    rules: _LaneRules,
-    own_zones: _Zones,
+    rules: LaneRules,
+    own_zones: Zones,
 ) -> Paths:
     slots, count = len(table.load), len(vehicles)
     column, lane = np.zeros((2, count, slots + 1), dtype=np.int64)

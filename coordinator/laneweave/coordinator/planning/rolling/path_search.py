@@ -23,10 +23,11 @@ from itertools import chain
 import numpy as np
 
 from laneweave.coordinator.planning.rolling import search_kernel as kernel
-from laneweave.coordinator.planning.rolling.arrays import Ints, Window, window
+from laneweave.coordinator.planning.rolling.arrays import Window, window
+from laneweave.coordinator.planning.rolling.lane_rules import Ints
 from laneweave.coordinator.planning.rolling.problem import (
     CellPath,
-    Sections,
+    OpenRoad,
     StreamCosts,
     StreamPlan,
     StreamRoad,
@@ -58,7 +59,7 @@ class StreamPlanner:
         vehicles: Sequence[StreamVehicle],
         before: StreamPlan | None = None,
         blocked: Collection[Cell] = (),
-        sections: Sections | None = None,
+        now: OpenRoad | None = None,
     ) -> StreamPlan:
         """Return paths for all vehicles from the beginning of a slot on.
 
@@ -67,13 +68,13 @@ class StreamPlanner:
             vehicles: all vehicles on the road, each in a different cell.
             before: an earlier plan; the search starts from its paths that are still valid.
             blocked: cells that must not be entered; a vehicle in one may leave it.
-            sections: where the lanes are open now; None: as on the road.
+            now: what of the road is open now; None: as always.
 
         Raises:
             ValueError: two vehicles share a cell, or one is off the lanes.
         """
         began_s = time.monotonic()
-        road = self.road.with_sections(sections)
+        road = self.road.as_open(now)
         _check(road, vehicles)
         end = road.length_m - slot * road.advance_m
         paths: dict[str, CellPath] = {v.vehicle: (v.cell,) for v in vehicles}

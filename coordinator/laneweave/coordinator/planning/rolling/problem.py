@@ -6,7 +6,9 @@ import math
 from collections.abc import Iterable, Iterator, Mapping
 from functools import cached_property
 
+import numpy as np
 from attrs import Attribute, Factory, evolve, field, frozen
+from numpy.typing import NDArray
 
 from laneweave.coordinator.planning.conflict_kinds import ConflictModel
 from laneweave.protocol.lattice import WAIT, Cell, Mode
@@ -14,15 +16,36 @@ from laneweave.protocol.road_layout import LaneChange, LaneSection, open_section
 from laneweave.protocol.scenario.road_tables import LaneRule, Restriction, SolidLine
 from laneweave.protocol.wire.messages import CAR
 
+Numbers = float | NDArray[np.float64]
+"""One number, or an array."""
 ROUNDING_M = 1e-6
 """Tolerance for comparing positions."""
 
-Sections = tuple[LaneSection, ...]
-"""Where the lanes are open; a section keeps its number while parts of it are closed for a time."""
 Section = tuple[float, float, int]
 """Begin and end of a lane section [m] for planning, and its index in `StreamRoad.sections`."""
 CellPath = tuple[Cell, ...]
 """Cells at the beginning of each slot, from the current one to the end of the last section."""
+
+
+@frozen
+class MovingPart:
+    """Part of a lane that all vehicles leave, and into which none may change; it may move."""
+
+    lane: int
+    from_m: float
+    """Where it begins when slot 0 begins."""
+    to_m: float
+    advance_m: float
+    """Distance that it travels in a slot."""
+
+
+@frozen
+class OpenRoad:
+    """What of a road is open now."""
+
+    sections: tuple[LaneSection, ...]
+    """Where the lanes are open; a section keeps its number while parts of it are closed."""
+    cleared: tuple[MovingPart, ...] = ()
 
 
 def _one_per_cell(_road: object, _field: Attribute[ConflictModel], model: ConflictModel) -> None:
@@ -64,6 +87,8 @@ class StreamRoad:
     """Where vehicles of some types may not drive."""
     solid_lines: tuple[SolidLine, ...] = ()
     """Lines that vehicles may not cross."""
+    cleared: tuple[MovingPart, ...] = ()
+    """Parts of lanes that all vehicles leave."""
     closing: range = range(0)
     """Indices of the sections that end before a part that is closed for a time."""
     around_m: float | None = None
@@ -75,20 +100,57 @@ class StreamRoad:
         rules: list[LaneRule] = [*self.restrictions, *self.solid_lines]
         return [one for one in rules if one.applies_to(vehicle_type)]
 
-    def forbidden_changes(self, vehicle_type: str) -> Iterator[tuple[LaneChange, float, float]]:
+    def forbidden_changes(
+        self, vehicle_type: str, slot: Numbers
+    ) -> Iterator[tuple[LaneChange, Numbers, Numbers]]:
         """Yield the lane changes that a type may not make, and from where to where [m].
 
         No part of the body may be there at any time of the move.
+
+        Args:
+            vehicle_type: the type.
+            slot: index of the slot, or an array of them.
         """
         for one in self.rules_of(vehicle_type):
             for change in one.changes:
                 yield change, one.from_m, one.to_m
+        for part in self.cleared:
+            from_m, to_m = self._extent_m(part, slot)
+            for lane in (part.lane - 1, part.lane + 1):
+                yield (lane, part.lane), from_m, to_m
 
-    def forbids(self, vehicle_type: str, change: LaneChange, rear_m: float, front_m: float) -> bool:
-        """Return whether a type may not change lanes between two positions."""
+    def places_to_leave(
+        self, vehicle_type: str, slot: Numbers
+    ) -> Iterator[tuple[int, Numbers, Numbers]]:
+        """Yield the lanes that a type should not be in, and from where to where [m].
+
+        Arguments as those of `forbidden_changes`.
+        """
+        for one in self.restrictions:
+            if one.applies_to(vehicle_type):
+                yield one.lane, one.from_m, one.to_m
+        for part in self.cleared:
+            yield part.lane, *self._extent_m(part, slot)
+
+    def _extent_m(self, part: MovingPart, slot: Numbers) -> tuple[Numbers, Numbers]:
+        """Return from where to where no part of a body may be at any time of a slot.
+
+        A body that travels with the lattice touches the moving part if its rear is before the
+        second position when the slot begins, and its front beyond the first when it ends.
+        """
+        moved_m = slot * part.advance_m
+        return (
+            part.from_m + moved_m + min(part.advance_m, self.advance_m),
+            part.to_m + moved_m + max(part.advance_m - self.advance_m, 0.0),
+        )
+
+    def forbids(
+        self, vehicle_type: str, change: LaneChange, slot: int, rear_m: float, front_m: float
+    ) -> bool:
+        """Return whether a type may not change lanes in a slot between two positions."""
         return any(
             own == change and rear_m < to_m - ROUNDING_M and front_m > from_m + ROUNDING_M
-            for own, from_m, to_m in self.forbidden_changes(vehicle_type)
+            for own, from_m, to_m in self.forbidden_changes(vehicle_type, slot)
         )
 
     def start_m(self, front_m: float, lanes: Iterable[int]) -> float:
@@ -119,14 +181,17 @@ class StreamRoad:
         """Return where moves end before the end of a section, whose end for planning is `to_m`."""
         return max(to_m, self.sections[number].to_m) if self.sections[number].exit else to_m
 
-    def with_sections(self, sections: Sections | None) -> StreamRoad:
-        """Return the road with the sections that are open now; None: as they are."""
-        if sections is None or sections == self.sections:
+    def as_open(self, now: OpenRoad | None) -> StreamRoad:
+        """Return the road as it is open now; None: as always."""
+        if now is None or (now.sections == self.sections and not now.cleared):
             return self
+        sections = now.sections
         closing, sorting_m = range(len(self.sections), len(sections)), self.sorting_m
-        if closing and self.around_m is not None:
+        if (closing or now.cleared) and self.around_m is not None:
             sorting_m = self.around_m, sorting_m[1]
-        return evolve(self, sections=sections, sorting_m=sorting_m, closing=closing)
+        return evolve(
+            self, sections=sections, sorting_m=sorting_m, closing=closing, cleared=now.cleared
+        )
 
     def position_m(self, slot: int, column: int) -> float:
         """Return the position of a column at the beginning of a slot."""
@@ -215,6 +280,8 @@ class StreamCosts:
     """Cost of ending elsewhere than at a target; up to twice as much near the end."""
     closing: float = 10.0
     """Extra cost of each slot in a lane that ends before a part that is closed for a time."""
+    cleared: float = 120.0
+    """Cost of each slot in a part of a lane that is cleared; then that of `restricted`, too."""
     restricted: float = 20.0
     """Cost of each slot in which the vehicle drives where it may not; less on long roads, since the
     costs of a path must remain below those of forbidden moves."""

@@ -13,7 +13,7 @@ from collections.abc import Collection, Mapping, Sequence
 
 from laneweave.coordinator.planning.rolling.problem import (
     CellPath,
-    Sections,
+    OpenRoad,
     StreamPlan,
     StreamRoad,
     StreamVehicle,
@@ -42,11 +42,11 @@ class RequestPlanner:
         vehicles: Sequence[StreamVehicle],
         before: StreamPlan | None = None,
         blocked: Collection[Cell] = (),
-        sections: Sections | None = None,
+        now: OpenRoad | None = None,
     ) -> StreamPlan:
         """Return paths with the granted moves in this slot; see `StreamPlanner.plan`."""
         del before
-        road, closed = self.road.with_sections(sections), frozenset(blocked)
+        road, closed = self.road.as_open(now), frozenset(blocked)
         moves = {vehicle.cell: WAIT for vehicle in vehicles}
         for vehicle in vehicles:
             wanted = self.requests.get(vehicle.vehicle, WAIT)

@@ -109,7 +109,7 @@ def _problems_of_move(
         if not road.is_open(lane, rear_m, front_m):
             yield f"{name} moves between {rear_m} m and {front_m} m, where lane {lane} is closed"
     change = here[1], there[1]
-    if road.forbids(vehicle.vehicle_type, change, rear_m, front_m):
+    if road.forbids(vehicle.vehicle_type, change, slot, rear_m, front_m):
         yield (
             f"{name} changes from lane {change[0]} to {change[1]} between {rear_m} m and "
             f"{front_m} m, where a {vehicle.vehicle_type} may not"

@@ -12,7 +12,7 @@ from collections.abc import Collection, Sequence
 from laneweave.agents.driving.driver import Drive, SolverStats
 from laneweave.coordinator.planning.rolling.problem import (
     CellPath,
-    Sections,
+    OpenRoad,
     StreamPlan,
     StreamVehicle,
 )
@@ -109,10 +109,10 @@ class LightPlanner:
         vehicles: Sequence[StreamVehicle],
         before: StreamPlan | None = None,
         blocked: Collection[Cell] = (),
-        sections: Sections | None = None,
+        now: OpenRoad | None = None,
     ) -> StreamPlan:
         """Return the cells of all vehicles at the start and the end of the next slot."""
-        del before, sections
+        del before, now
         rng = random.Random(f"{self._seed}/{slot}")  # noqa: S311 (simulation, no secrets)
         taken = {vehicle.cell for vehicle in vehicles} | set(blocked)
         paths: dict[str, CellPath] = {vehicle.vehicle: (vehicle.cell,) for vehicle in vehicles}

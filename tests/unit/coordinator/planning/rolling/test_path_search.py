@@ -16,6 +16,7 @@ from laneweave.coordinator.planning.rolling import search_kernel as kernel
 from laneweave.coordinator.planning.rolling.arrays import window
 from laneweave.coordinator.planning.rolling.path_search import StreamPlanner
 from laneweave.coordinator.planning.rolling.problem import (
+    OpenRoad,
     StreamCosts,
     StreamPlan,
     StreamRoad,
@@ -300,7 +301,7 @@ CLOSED_AT_700 = (
 def test_no_lane_is_missed_in_the_lane_that_is_closed(lane: int) -> None:
     """Neither vehicle can reach its lane, and it costs the same wherever they miss it."""
     vehicle = StreamVehicle("a", (28, lane), 1)  # at 420 m; behind 790 m there is no room
-    road = evolve(OPEN.with_sections(CLOSED_AT_700), sorting_m=(400.0, 700.0))
+    road = evolve(OPEN.as_open(OpenRoad(CLOSED_AT_700)), sorting_m=(400.0, 700.0))
     plan = StreamPlanner(road).plan(0, [vehicle])
     assert plan.missed == ("a",)
     assert plan.paths["a"][-1][1] == 0
@@ -308,12 +309,12 @@ def test_no_lane_is_missed_in_the_lane_that_is_closed(lane: int) -> None:
 
 def test_lanes_are_changed_earlier_while_a_part_is_closed() -> None:
     early = evolve(OPEN, around_m=100.0)
-    assert early.with_sections(CLOSED_AT_700).sorting_m[0] == 100.0
-    assert list(early.with_sections(CLOSED_AT_700).closing) == [2]
-    assert early.with_sections(OPEN.sections).sorting_m[0] == 400.0
+    assert early.as_open(OpenRoad(CLOSED_AT_700)).sorting_m[0] == 100.0
+    assert list(early.as_open(OpenRoad(CLOSED_AT_700)).closing) == [2]
+    assert early.as_open(OpenRoad(OPEN.sections)).sorting_m[0] == 400.0
     vehicle = StreamVehicle("a", (10, 1), 0)  # at 150 m
     assert StreamPlanner(early).plan(0, [vehicle]).paths["a"][1] == (10, 1)
-    plan = StreamPlanner(early).plan(0, [vehicle], sections=CLOSED_AT_700)
+    plan = StreamPlanner(early).plan(0, [vehicle], now=OpenRoad(CLOSED_AT_700))
     assert plan.paths["a"][1][1] == 0
 
 

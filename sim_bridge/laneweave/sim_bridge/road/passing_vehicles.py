@@ -1,0 +1,287 @@
+"""Vehicles of other systems: each drives in one lane at a speed of its own.
+
+A slow one is a part of a lane that is closed, which jumps ahead once in a slot: vehicles leave its
+lane, or stop at the stop line of the part as it was then, and start again when the vehicle is far
+ahead. Before a fast one, the lane is cleared: vehicles leave it, and none enters it. Each brakes
+for what is ahead of it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+
+from attrs import Factory, define, field
+
+from laneweave.protocol.road_layout import TemporaryClosure
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.road_tables import RoadEvent
+from laneweave.protocol.vehicle.lane_ends import HEEDED_BRAKING_MPS2
+from laneweave.protocol.vehicle.motion import State
+from laneweave.protocol.vehicle.sudden_stops import stops_before
+from laneweave.protocol.wire.events import PART_CLOSED, PART_OPENED
+from laneweave.protocol.wire.messages import Name
+from laneweave.protocol.wire.obstacle_messages import PASSING, Cleared, Obstacle
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import Size
+from laneweave.sim_bridge.road.vehicle import RoadVehicle
+from laneweave.sim_bridge.road.vehicles_in_part import (
+    cleared_before_m,
+    vehicles_in_part,
+)
+
+CLEARED_BEHIND_M = 10.0
+"""Length of the lane behind a fast vehicle that none may enter."""
+AHEAD_M = 1.0
+"""How far a closed part reaches beyond the front of a slow vehicle."""
+MIN_GAP_M = 2.0
+"""Gap behind a vehicle that stands."""
+ACCEL_MPS2, BRAKING_MPS2, HARDEST_MPS2 = 1.5, 4.0, 9.0
+"""Acceleration; deceleration with which it plans to stop; maximum deceleration."""
+REACTION_S = 1.0
+PREDICTED_M, PREDICTED_MPS = 5.0, 2.0
+"""Errors of the published motion from which a new one is published."""
+
+
+@define
+class PassingVehicle:
+    """A vehicle of another system on the road."""
+
+    name: Name
+    passage: RoadEvent
+    since_s: float
+    s_m: float
+    """Position of its front."""
+    speed_mps: float
+    accel_mps2: float = 0.0
+    lowest_mps: float = Factory(lambda self: self.speed_mps, takes_self=True)
+    """Lowest speed so far."""
+    cleared: Cleared | None = None
+    """What is cleared for it."""
+    closed: TemporaryClosure | None = None
+    """The part of its lane that is closed around it."""
+
+    @property
+    def length_m(self) -> float:
+        """Length of the vehicle: that of the part of the lane in which it enters."""
+        return self.passage.to_m - self.passage.from_m
+
+    @property
+    def rear_m(self) -> float:
+        """Position of its rear."""
+        return self.s_m - self.length_m
+
+    @property
+    def recorded(self) -> Obstacle:
+        """The vehicle as it is recorded: where it has entered, and its lowest speed."""
+        passage = self.passage
+        return Obstacle(
+            lane=passage.lane,
+            from_m=passage.from_m,
+            to_m=passage.to_m,
+            cause=PASSING,
+            since_s=self.since_s,
+            vehicle=self.name,
+            speed_mps=self.lowest_mps,
+        )
+
+    def step(self, gap_m: float, lead_mps: float, tick_s: float) -> None:
+        """Drive one tick behind a vehicle ahead, if any: an infinite gap.
+
+        Krauß, Wagner and Gawron, "Metastable states in a microscopic model of traffic flow",
+        Physical Review E 55, 1997, without random deviations.
+        """
+        speed_mps = min(self.speed_mps + ACCEL_MPS2 * tick_s, self.passage.speed_mps)
+        if gap_m < math.inf:
+            reacts_mps = BRAKING_MPS2 * REACTION_S
+            room = max(gap_m - MIN_GAP_M, 0.0)
+            safe_mps = math.sqrt(reacts_mps**2 + lead_mps**2 + 2.0 * BRAKING_MPS2 * room)
+            speed_mps = min(speed_mps, safe_mps - reacts_mps)
+        speed_mps = max(speed_mps, self.speed_mps - HARDEST_MPS2 * tick_s, 0.0)
+        self.accel_mps2 = (speed_mps - self.speed_mps) / tick_s
+        self.s_m += 0.5 * (self.speed_mps + speed_mps) * tick_s
+        self.speed_mps = speed_mps
+        self.lowest_mps = min(self.lowest_mps, speed_mps)
+
+
+@define
+class PassingVehicles:
+    """All vehicles of other systems on a road."""
+
+    _scenario: Scenario
+    _pending: list[RoadEvent]
+    on_road: list[PassingVehicle] = field(factory=list)
+    _count: int = 0
+    _announced: dict[int, Cleared] = field(factory=dict)
+    """What is cleared for vehicles that wait for room to enter, by the id of the passage."""
+    _slot: int = -1
+    _changes: list[tuple[str, Obstacle]] = field(factory=list)
+
+    def __bool__(self) -> bool:
+        """Return whether there are vehicles, or will be."""
+        return bool(self._pending or self.on_road)
+
+    @property
+    def cleared(self) -> tuple[Cleared, ...]:
+        """The parts of lanes that are cleared now."""
+        own = (one.cleared for one in self.on_road)
+        return (*(each for each in own if each is not None), *self._announced.values())
+
+    @property
+    def states(self) -> dict[Name, State]:
+        """State of each vehicle: (s, v, a, y, v_y, a_y)."""
+        lattice = self._scenario.lattice
+        return {
+            one.name: (
+                one.s_m,
+                one.speed_mps,
+                one.accel_mps2,
+                lattice.cell_y_m(one.passage.lane),
+                0.0,
+                0.0,
+            )
+            for one in self.on_road
+        }
+
+    @property
+    def sizes(self) -> dict[str, Size]:
+        """Length and width of each vehicle [m]."""
+        width_m = self._scenario.vehicle.width_m
+        return {one.name: (one.length_m, width_m) for one in self.on_road}
+
+    def is_fast(self, passage: RoadEvent) -> bool:
+        """Return whether a vehicle comes from behind: it is at least as fast as the lattice."""
+        return passage.speed_mps >= self._scenario.lattice.speed_mps
+
+    def update(self, vehicles: Mapping[Name, RoadVehicle], t_s: float) -> None:
+        """Let vehicles enter and leave, and update what is closed and cleared for them."""
+        end_m = self._scenario.road.length_m
+        for one in list(self.on_road):
+            if one.s_m >= end_m or t_s >= one.passage.until_s:
+                self.on_road.remove(one)
+                self._changes.append((PART_OPENED, one.recorded))
+        for passage in [one for one in self._pending if t_s >= one.at_s]:
+            if id(passage) not in self._announced:
+                self._announced[id(passage)] = self._cleared_before(passage, t_s)
+            if self._has_room(passage, vehicles, t_s):
+                self._pending.remove(passage)
+                self._announced.pop(id(passage), None)
+                self._count += 1
+                entered = PassingVehicle(
+                    Name(f"other-{self._count}"), passage, t_s, passage.to_m, passage.speed_mps
+                )
+                self.on_road.append(entered)
+                self._changes.append((PART_CLOSED, entered.recorded))
+        slot = math.floor(t_s / self._scenario.timing.cycles_s[0] + 1e-9)
+        for one in self.on_road:
+            if self.is_fast(one.passage):
+                one.cleared = self._cleared_for(one, t_s)
+            elif one.closed is None or slot != self._slot:
+                one.closed = self._closed_around(one)
+        self._slot = slot
+
+    def step(self, vehicles: Iterable[RoadVehicle], tick_s: float) -> None:
+        """Move all vehicles by a tick."""
+        if not self.on_road:
+            return
+        bodies = [
+            (lane, one.state[0], one.state[0] - one.size[0], one.state[1])
+            for one in vehicles
+            for lane in one.lanes_used
+        ]
+        bodies += [(one.passage.lane, one.s_m, one.rear_m, one.speed_mps) for one in self.on_road]
+        for one in self.on_road:
+            ahead = [
+                (rear_m - one.s_m, speed_mps)
+                for lane, front_m, rear_m, speed_mps in bodies
+                if lane == one.passage.lane and front_m > one.s_m
+            ]
+            one.step(*min(ahead, default=(math.inf, 0.0)), tick_s)
+
+    def _has_room(
+        self, passage: RoadEvent, vehicles: Mapping[Name, RoadVehicle], t_s: float
+    ) -> bool:
+        """Return whether a vehicle can enter: nobody has to brake hard for it, nor it for others.
+
+        Not even if the vehicle ahead stops suddenly.
+        """
+        lane, from_m, to_m = passage.lane, passage.from_m, passage.to_m
+        waits = t_s < passage.at_s + passage.clear_s
+        if any(lane == one.passage.lane and one.rear_m <= to_m + MIN_GAP_M for one in self.on_road):
+            return False
+        if not self.is_fast(passage):
+            found = vehicles_in_part(self._scenario, lane, from_m, to_m, vehicles.values())
+            return found.allow_closing(waits=waits)
+        lattice_mps = self._scenario.lattice.speed_mps
+        free_m = to_m + (self._cleared_ahead_m(passage, 2) if waits else 0.0)
+        for vehicle in vehicles.values():
+            s_m, speed_mps = vehicle.state[:2]
+            if passage.lane not in vehicle.lanes_used:
+                continue
+            rear_m = s_m - vehicle.size[0]
+            if s_m <= passage.from_m:
+                if not _follows(passage.from_m, s_m, speed_mps, passage.speed_mps):
+                    return False
+            elif rear_m < free_m or not _follows(
+                rear_m, passage.to_m, passage.speed_mps, min(speed_mps, lattice_mps)
+            ):
+                return False
+        return True
+
+    def _cleared_before(self, passage: RoadEvent, t_s: float) -> Cleared:
+        """Return what is cleared for a vehicle that waits for room to enter."""
+        from_m, to_m = passage.from_m, passage.to_m
+        if self.is_fast(passage):
+            to_m += self._cleared_ahead_m(passage, 1)
+        else:
+            from_m -= cleared_before_m(self._scenario)
+        return Cleared(passage.lane, from_m, to_m, 0.0, t_s, PASSING)
+
+    def _cleared_ahead_m(self, passage: RoadEvent, slots: int) -> float:
+        """Return how far ahead of a fast vehicle its lane must be free, so that it keeps its speed.
+
+        Vehicles there have some slots of time to leave the lane.
+        """
+        lattice_mps, slot_s = self._scenario.lattice.speed_mps, self._scenario.timing.cycles_s[0]
+        gained_mps = passage.speed_mps - lattice_mps
+        return gap_needed_m(passage.speed_mps, lattice_mps) + slots * slot_s * gained_mps
+
+    def _cleared_for(self, one: PassingVehicle, t_s: float) -> Cleared:
+        """Return what is cleared for a fast vehicle: as before, while it moves as predicted."""
+        before = one.cleared
+        if before is not None and abs(before.speed_mps - one.speed_mps) < PREDICTED_MPS:
+            predicted_m = before.front_m + before.speed_mps * (t_s - before.at_s)
+            if abs(predicted_m - one.s_m) < PREDICTED_M:
+                return before
+        return Cleared(
+            one.passage.lane,
+            one.rear_m - CLEARED_BEHIND_M,
+            one.s_m + self._cleared_ahead_m(one.passage, 1),
+            one.speed_mps,
+            t_s,
+            PASSING,
+            one.name,
+            one.s_m,
+            one.length_m,
+        )
+
+    def _closed_around(self, one: PassingVehicle) -> TemporaryClosure:
+        """Return the part of a lane in which a slow vehicle is up to the end of the next slot."""
+        ahead_m = 2.0 * self._scenario.timing.cycles_s[0] * one.passage.speed_mps + AHEAD_M
+        return TemporaryClosure(one.passage.lane, one.rear_m, one.s_m + ahead_m)
+
+    def pop_changes(self) -> list[tuple[str, Obstacle]]:
+        """Return the vehicles that have entered or left since the last call."""
+        changes, self._changes = self._changes, []
+        return changes
+
+
+def gap_needed_m(speed_mps: float, lead_mps: float) -> float:
+    """Return the gap from which a vehicle does not brake for the one ahead; see `step`."""
+    reacts_mps = BRAKING_MPS2 * REACTION_S
+    room = (speed_mps + reacts_mps) ** 2 - reacts_mps**2 - lead_mps**2
+    return MIN_GAP_M + max(room, 0.0) / (2.0 * BRAKING_MPS2)
+
+
+def _follows(rear_m: float, front_m: float, speed_mps: float, lead_mps: float) -> bool:
+    """Return whether a vehicle can stop behind one ahead that brakes hard."""
+    return stops_before(rear_m + lead_mps**2 / (2.0 * HEEDED_BRAKING_MPS2), front_m, speed_mps)

@@ -1,0 +1,75 @@
+"""Which vehicles are in the way when a part of a lane is to be closed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from attrs import frozen
+
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.vehicle.re_entry import re_entry
+from laneweave.protocol.vehicle.sudden_stops import room_before_part_m, stops_before
+from laneweave.protocol.wire.messages import Name
+from laneweave.sim_bridge.road.vehicle import RoadVehicle
+
+
+@frozen
+class VehiclesInPart:
+    """The vehicles in the way of a part that is to be closed."""
+
+    inside: tuple[Name, ...]
+    near: tuple[Name, ...]
+    """Those so near that they could not stop before it, or that wait there without cells."""
+    coming: tuple[Name, ...]
+    """Those that could not stop at the stop line before it."""
+
+    def allow_closing(self, *, waits: bool) -> bool:
+        """Return whether the part may be closed; `waits`: only if nobody has to brake hard."""
+        return not (self.inside or self.near or (self.coming and waits))
+
+    @property
+    def problem(self) -> str:
+        """Why the part cannot be closed, in words; empty: it can."""
+        inside, near = map(len, (self.inside, self.near))
+        texts = []
+        if inside:
+            texts.append(f"{inside} {_vehicles(inside)} in it ({_some(self.inside)})")
+        if near:
+            also = "more " if inside else ""
+            verb = "cannot stop before it"
+            texts.append(f"{near} {also}{verb} ({_some(self.near)})")
+        return " and ".join(texts)
+
+
+def _vehicles(count: int) -> str:
+    return "vehicle is" if count == 1 else "vehicles are"
+
+
+def _some(names: tuple[Name, ...]) -> str:
+    return ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
+
+
+def cleared_before_m(scenario: Scenario) -> float:
+    """Return the length of a lane before a part that is cleared with it."""
+    return room_before_part_m(scenario, re_entry(scenario).room_m)
+
+
+def vehicles_in_part(
+    scenario: Scenario, lane: int, from_m: float, to_m: float, vehicles: Iterable[RoadVehicle]
+) -> VehiclesInPart:
+    """Return the vehicles in the way of a part that is to be closed from and to a position."""
+    inside, near, coming = list[Name](), list[Name](), list[Name]()
+    first_m, room_m = from_m - cleared_before_m(scenario), re_entry(scenario).room_m
+    for vehicle in vehicles:
+        s_m, speed_mps = vehicle.state[:2]
+        if lane not in vehicle.lanes_used or s_m - vehicle.size[0] >= to_m or s_m < first_m:
+            continue
+        if s_m >= from_m:
+            inside.append(vehicle.name)
+        elif vehicle.controller.off_lattice is not None and from_m - s_m < room_m:
+            near.append(vehicle.name)  # it would start into the part
+        elif stops_before(from_m, s_m, speed_mps):
+            coming.append(vehicle.name)
+        else:
+            near.append(vehicle.name)
+    return VehiclesInPart(tuple(inside), tuple(near), tuple(coming))
