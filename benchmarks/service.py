@@ -57,8 +57,8 @@ from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
 from laneweave.coordinator.planning.response import PlanResponse
 from laneweave.coordinator.planning.solve import plan
 from laneweave.coordinator.service.client import AsyncPlanClient, PlanClient, PlanError
-from laneweave.coordinator.service.format import JSON
 from laneweave.launch.bench.request_families import formation_request
+from laneweave.protocol.runtime.queries import JSON
 from laneweave.protocol.scenario.formation_table import DEFAULT_CONFLICTS
 from laneweave.protocol.security.connection import Access
 from laneweave.protocol.transports.zenoh.transport import ZenohTransport

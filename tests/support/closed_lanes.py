@@ -104,6 +104,7 @@ class LonelyRoad:
         self.roadside.assign_empty_cells(self.vehicles)
         for vehicle in self.vehicles.values():
             vehicle.step(self.tick)
+        self.roadside.obstacles.passing.step(self.vehicles.values(), scenario.runtime.tick_s)
         self.tick += 1
         exits = Exits(scenario.geometry.sections, scenario.road.length_m)
         for name, vehicle in list(self.vehicles.items()):
@@ -119,8 +120,10 @@ class LonelyRoad:
         """Let all vehicles sense their neighbours, and record overlaps."""
         road, size = self.scenario.road, self.scenario.vehicle
         states: dict[str, State] = {name: vehicle.state for name, vehicle in self.vehicles.items()}
+        passing = self.roadside.obstacles.passing
+        states |= passing.states
         poses: dict[str, Pose] = {name: pose_of(state) for name, state in states.items()}
-        bodies = Bodies(poses, size.length_m, size.width_m)
+        bodies = Bodies(poses, size.length_m, size.width_m, passing.sizes)
         accels: dict[str, float] = {name: state[2] for name, state in states.items()}
         neighbours = bodies.exact_neighbours(road.lanes, road.lane_width_m, accels)
         for name, vehicle in self.vehicles.items():

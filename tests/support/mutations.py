@@ -14,7 +14,7 @@ from typing import Any
 import msgpack
 from attrs import frozen
 
-from laneweave.coordinator.service.format import CODES, FAILED, OVERLOADED
+from laneweave.protocol.runtime.queries import CODES, FAILED, OVERLOADED
 from laneweave.protocol.runtime.transport import Answer
 from laneweave.protocol.security.connection import Access
 from laneweave.protocol.transports.zenoh.transport import ZenohTransport

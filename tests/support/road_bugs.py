@@ -30,6 +30,7 @@ from laneweave.sim_bridge.road.formation_building import (
 )
 from laneweave.sim_bridge.road.lane_end_control import LaneEndControl
 from laneweave.sim_bridge.road.obstacles import Obstacles
+from laneweave.sim_bridge.road.passing_vehicles import PassingVehicle, PassingVehicles
 from laneweave.sim_bridge.road.roadside import EntranceRoom, Roadside
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
 from laneweave.sim_bridge.road.vehicles_in_part import VehiclesInPart
@@ -41,6 +42,7 @@ Call = Callable[..., None]
 """A method that is replaced."""
 Vehicles = Mapping[Name, RoadVehicle]
 LANE_ENDS, OBSTACLES, RAMPS = "lane ends", "lanes closed for a time", "ramps, exits"
+PASSING_VEHICLES = "vehicles of other systems"
 FORMATIONS = "formations on roads"
 """What the bugs are about."""
 
@@ -262,6 +264,37 @@ def entrances_stay_open(*_: object) -> None:
 @breaks(OBSTACLES, RoadVehicle, "close")
 def controllers_do_not_know(*_: object) -> None:
     """Motion controllers do not learn which parts are closed."""
+
+
+# --- vehicles of other systems ------------------------------------------------------------------
+
+
+@breaks(PASSING_VEHICLES, PassingVehicles, "_closed_around")
+def closed_parts_do_not_move(
+    closed_around: Callable[..., TemporaryClosure], self: PassingVehicles, one: PassingVehicle
+) -> TemporaryClosure:
+    """The part that is closed around a slow vehicle stays where the vehicle has entered."""
+    return one.closed or closed_around(self, one)
+
+
+@breaks(PASSING_VEHICLES, PassingVehicle, "step")
+def others_brake_for_nobody(
+    step: Call, self: PassingVehicle, _gap_m: float, lead_mps: float, tick_s: float
+) -> None:
+    """A vehicle of another system does not brake for what is ahead of it."""
+    step(self, math.inf, lead_mps, tick_s)
+
+
+@breaks(PASSING_VEHICLES, PassingVehicles, "_has_room")
+def others_enter_without_room(*_: object) -> bool:
+    """A vehicle of another system enters where a vehicle is."""
+    return True
+
+
+@breaks(PASSING_VEHICLES, EntranceRoom, "closed_points")
+def cleared_lanes_are_entered(*_: object) -> set[int]:
+    """Vehicles enter a lane that is cleared, and just behind a vehicle of another system."""
+    return set()
 
 
 # --- ramps and exits --------------------------------------------------------------------------

@@ -17,8 +17,8 @@ from attrs import define, field
 from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.coordinator.planning.response import PlanResponse
 from laneweave.coordinator.service.client import PlanClient, PlanError
-from laneweave.coordinator.service.format import JSON
 from laneweave.coordinator.service.rendezvous import is_assigned_to
+from laneweave.protocol.runtime.queries import JSON
 from laneweave.protocol.runtime.transport import Delivery, TokenDown, TokenUp
 from laneweave.protocol.security.connection import Access
 from laneweave.protocol.transports.zenoh.transport import ZenohTransport

@@ -27,7 +27,7 @@ from laneweave.coordinator.service.client import (
     RequestRefusedError,
     ServiceUnavailableError,
 )
-from laneweave.coordinator.service.format import LATE, OVERLOADED
+from laneweave.protocol.runtime.queries import LATE, OVERLOADED
 from laneweave.protocol.runtime.transport import Answer
 from laneweave.protocol.transports.zenoh.transport import ZenohTransport
 from laneweave.protocol.wire.topics import SERVICE, Keys

@@ -27,8 +27,10 @@ from laneweave.protocol.runtime.node import (
     Event,
     Listen,
     PeerUp,
+    QueryArrived,
     Refuse,
     Send,
+    Serve,
     Started,
     Stopping,
     Wakeup,
@@ -45,6 +47,7 @@ from laneweave.protocol.wire.topics import (
     EVENT,
     HEARTBEAT,
     REPORT,
+    ROAD_REQUEST,
     VEHICLE_ALIVE,
 )
 from laneweave.sim_bridge.agent_log import AgentLog
@@ -54,6 +57,7 @@ from laneweave.sim_bridge.road.caretakers import notify_left
 from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.road.demand_queue import NO_OUTSIDE_TRAFFIC, OutsideTraffic
 from laneweave.sim_bridge.road.obstacles import Breakdown
+from laneweave.sim_bridge.road.road_desk import RoadDesk
 from laneweave.sim_bridge.road.roadside import Roadside
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
 from laneweave.sim_bridge.simulated_road import SimulatedRoad
@@ -178,6 +182,7 @@ class BridgeCore:
         self.road = SimulatedRoad(
             scenario, self._roadside, record, new_incarnation, RoadVehicle.entering, incarnation
         )
+        self._desk = RoadDesk(scenario, self._roadside.obstacles)
         self._answers = self.road.answers
         self._pace = TickPace(scenario.runtime, pace)
         self._unreported: set[str] = {BRIDGE}
@@ -188,7 +193,7 @@ class BridgeCore:
         self._tick_began = 0.0
         self._deployment = Deployment(scenario, incarnation, record)
         self._agent_log = AgentLog(self._deployment.fleet_of)
-        self._passing: set[Name] = set()
+        self._passing: set[str] = set()
         """Vehicles of other systems in the world."""
         self._opened_s = self._census_s = 0.0
         """When the current tick was opened; when the census is published next if it waits."""
@@ -285,8 +290,11 @@ class BridgeCore:
                 # First: processes compare settings before they act.
                 yield from self._deployment.start(now_s)
                 yield from self.road.connect()
+                yield Serve(ROAD_REQUEST)
                 self._pace.start(now_s)
                 self._open_tick(now_s)
+            case QueryArrived():
+                yield from self._desk.take(event, self.t_s)
             case Arrived(_, parameters, message):
                 yield from self._on_message(message, parameters, now_s)
             case PeerUp(topic, parameters) if topic is VEHICLE_ALIVE:
@@ -348,6 +356,7 @@ class BridgeCore:
             if now_s >= self._until_s:
                 self._enter()
                 yield from self.road.begin_tick(now_s)
+                yield from self._desk.update(self.vehicles, self.t_s)
                 self._agent_log.update(self.road.caretakers.vehicles, self.vehicles, self.t_s)
                 self.phase = TickPhase.ANSWERS
             elif now_s >= self._census_s:
@@ -412,7 +421,7 @@ class BridgeCore:
         self._until_s = self._pace.next_s(now_s, answering=answering)
         self.phase = TickPhase.PACE
 
-    def _show_passing(self, states: Mapping[Name, State]) -> None:
+    def _show_passing(self, states: Mapping[str, State]) -> None:
         """Add vehicles of other systems to the world, and remove those that have left."""
         for name in self._passing - states.keys():
             self._world.remove(name)
@@ -432,6 +441,7 @@ class BridgeCore:
 
     def _shut_down(self, now_s: float) -> Iterator[Effect]:
         on_road = self.vehicles.values()
+        yield from self._desk.close()
         yield from self._roadside.publish(self.tick, self.t_s, on_road, ended=True)
         yield from self.road.caretakers.notify_departed(self.tick)
         for vehicle in on_road:

@@ -64,7 +64,7 @@ def show_bodies(
     `t_s` is the road time after the tick; `closed` are parts of lanes in which no body may be now,
     `passing` vehicles of other systems.
     """
-    states = {name: vehicle.state for name, vehicle in vehicles.items()}
+    states: dict[str, State] = {name: vehicle.state for name, vehicle in vehicles.items()}
     if passing:
         states |= passing.states
     for name, state in states.items():

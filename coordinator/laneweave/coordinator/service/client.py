@@ -36,18 +36,18 @@ from attrs import define
 
 from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.coordinator.planning.response import PlanResponse
-from laneweave.coordinator.service.format import (
+from laneweave.coordinator.service.cancellation import cancel_request
+from laneweave.protocol.config.scenario_files import load_scenario
+from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.runtime.queries import (
     CANCELLED,
     INVALID,
     JSON,
     LATE,
     OVERLOADED,
     Refusal,
-    cancel_request,
     format_of,
 )
-from laneweave.protocol.config.scenario_files import load_scenario
-from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.runtime.transport import Answer
 from laneweave.protocol.security.access_control import access_of
 from laneweave.protocol.security.connection import Access

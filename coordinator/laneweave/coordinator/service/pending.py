@@ -9,7 +9,7 @@ from typing import Self
 from attrs import define, field, frozen
 
 from laneweave.coordinator.planning.request import PlanRequest
-from laneweave.coordinator.service.format import Format
+from laneweave.protocol.runtime.queries import Format
 from laneweave.protocol.runtime.round_robin import RoundRobin
 
 

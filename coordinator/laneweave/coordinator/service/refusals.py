@@ -12,9 +12,9 @@ from itertools import count
 
 from attrs import define, field, frozen
 
-from laneweave.coordinator.service.format import OVERLOADED, Refusal
 from laneweave.coordinator.service.pending import OpenQuery
 from laneweave.protocol.runtime.node import Reply
+from laneweave.protocol.runtime.queries import OVERLOADED, Refusal
 
 PROMPT = 64
 """Number of refusals that a client gets at once, before their rate is limited."""

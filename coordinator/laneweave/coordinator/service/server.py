@@ -19,15 +19,7 @@ from attrs import frozen
 from laneweave.coordinator.planning.plug_ins.registry import checked_solver
 from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.coordinator.planning.response import PlanFunction, PlanResponse
-from laneweave.coordinator.service.format import (
-    CANCELLED,
-    FAILED,
-    INVALID,
-    LATE,
-    Format,
-    Refusal,
-    format_of,
-)
+from laneweave.coordinator.service.cancellation import cancelled_id
 from laneweave.coordinator.service.pending import (
     ClientSession,
     OpenQuery,
@@ -46,6 +38,15 @@ from laneweave.protocol.runtime.node import (
     Effect,
     Reply,
     StopJob,
+)
+from laneweave.protocol.runtime.queries import (
+    CANCELLED,
+    FAILED,
+    INVALID,
+    LATE,
+    Format,
+    Refusal,
+    format_of,
 )
 from laneweave.protocol.scenario.deployment_fields import Service
 from laneweave.protocol.scenario.formation_table import DEFAULT_SOLVER
@@ -285,7 +286,7 @@ class PlanningService:
             session: session of the client; only the client's own queries are cancelled.
         """
         form = format_of(payload, encoding)
-        entry = self._by_id.get(form.read_cancelled_id(payload))
+        entry = self._by_id.get(cancelled_id(form, payload))
         queries = [] if entry is None else entry.queries
         own = [query for query in queries if query.session.client == session.client]
         if entry is None or not own:

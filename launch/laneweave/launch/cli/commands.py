@@ -68,6 +68,11 @@ COMMANDS = {
         "status",
         "Listen to a deployment and print its state; exit with status 1 if it is unhealthy.",
     ),
+    "road": CommandEntry(
+        "road_command",
+        "road",
+        "Close parts of lanes of a running deployment, and open them again.",
+    ),
     "faults": CommandEntry("faults_command", "faults", "Inject faults into a deployment."),
     "sweep": CommandEntry(
         "study_commands",

@@ -72,6 +72,7 @@ def named_identities(scenario: Scenario) -> Iterator[Identity]:
         (Party.COORDINATOR, coordinator_names(scenario)),
         (Party.FLEET, tuple(security.fleets)),
         (Party.CLIENT, security.clients),
+        (Party.OPERATOR, security.operators),
         (Party.OBSERVER, security.observers),
         (Party.VEHICLE, security.vehicles),
     ):

@@ -75,7 +75,9 @@ def check_part(scenario: Scenario, name: str, lane: int, from_m: float, to_m: fl
     ]
     needed_m = room_before_part_m(scenario, re_entry(scenario).room_m)
     least_m = begins_m(scenario, lane, from_m) + needed_m
-    places = " or ".join(f"{one.from_m + needed_m:g} to {last_m:g} m" for one, last_m in sections)
+    places = " or ".join(
+        f"{max(one.from_m, 0.0) + needed_m:g} to {last_m:g} m" for one, last_m in sections
+    )
     require(
         from_m >= least_m
         and any(one.from_m < from_m and to_m < last_m for one, last_m in sections),

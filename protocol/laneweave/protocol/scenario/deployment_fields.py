@@ -126,6 +126,8 @@ class Security:
     """Vehicles that may have their own process; empty: all that may arrive."""
     clients: tuple[str, ...] = field(default=("plan",), validator=key_parts)
     """Processes that may query the planning service."""
+    operators: tuple[str, ...] = field(default=("operator",), validator=key_parts)
+    """Processes that may close parts of lanes, and open them again."""
     observers: tuple[str, ...] = field(default=("ping", "status", "watch"), validator=key_parts)
     """Processes that may only subscribe."""
 

@@ -44,6 +44,8 @@ class RoadEvent:
     """Road time from which it is closed."""
     until_s: float = field(default=math.inf, validator=within(0.0, math.inf))
     """Road time until which it is closed; by default, for ever."""
+    for_s: float = field(default=math.inf, validator=within(0.0, math.inf))
+    """Time after which it is opened again, unless `until_s` is earlier."""
     speed_mps: float = field(default=0.0, validator=within(0.0, 60.0))
     """Speed of a vehicle of another system; 0: a closed part."""
     clear_s: float = field(default=20.0, validator=within(0.0, 600.0))

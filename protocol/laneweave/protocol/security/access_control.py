@@ -49,7 +49,7 @@ PRIVATE_KEY = "LANEWEAVE_PRIVATE_KEY"
 # Zenoh accepts unknown identities but silently drops their traffic, so reject them here.
 KNOWN_RULE = (
     "an identity of this configuration: runtime.coordinators, security.fleets, "
-    "security.vehicles, security.clients, security.observers"
+    "security.vehicles, security.clients, security.operators, security.observers"
 )
 REQUEST_MARGIN = 2
 """Factor by which the router's size limit exceeds the service's, so that the service can reject a

@@ -1,6 +1,7 @@
 """Identities and incarnations of processes.
 
-    router  bridge  coordinator.NAME  vehicle.NAME  fleet.NAME  client.NAME  observer.NAME
+    router  bridge  coordinator.NAME  vehicle.NAME  fleet.NAME  client.NAME  operator.NAME
+    observer.NAME
 
 The *identity* is the common name of a process's certificate and determines its rights
 (`security.access_control`). The *incarnation* identifies one start of a process: a time in ns whose
@@ -26,8 +27,8 @@ from laneweave.protocol.wire.topics import Party
 MAX_COMMON_NAME = 64
 """Maximum number of characters of a common name (X.520)."""
 IDENTITY_RULE = (
-    "router, bridge, or coordinator, vehicle, fleet, client or observer with a dot and a name, "
-    f"at most {MAX_COMMON_NAME} characters"
+    "router, bridge, or coordinator, vehicle, fleet, client, operator or observer with a dot and a "
+    f"name, at most {MAX_COMMON_NAME} characters"
 )
 _PROCESS_BITS = 22
 """Number of low bits of an incarnation that identify the process: as many as a Linux process id

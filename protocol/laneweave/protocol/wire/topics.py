@@ -61,6 +61,8 @@ class Party(StrEnum):
     """Agent process of several vehicles, possibly a shard of the census."""
     CLIENT = "client"
     """Queries the planning service."""
+    OPERATOR = "operator"
+    """Closes parts of lanes, and opens them again."""
     OBSERVER = "observer"
     """Only subscribes."""
 
@@ -223,6 +225,11 @@ SERVICE = Topic(
 SERVICE_CANCEL = Topic(
     "service-cancel", "service/cancel", None, Party.CLIENT, Quality.ASSURED,
     readers=(Party.COORDINATOR,), exchange=Exchange.QUERIES,
+    remark="a query",
+)  # fmt: skip
+ROAD_REQUEST = Topic(
+    "road-request", "road/request", None, Party.OPERATOR, Quality.ASSURED,
+    readers=(Party.BRIDGE,), exchange=Exchange.QUERIES,
     remark="a query",
 )  # fmt: skip
 

@@ -84,6 +84,8 @@ class ActiveObstacle:
     until_s: float = math.inf
     """When the cause is over; infinite: not known."""
     breakdown: Breakdown | None = None
+    event: RoadEvent | None = None
+    """The cause of a part that is closed without a vehicle."""
     vehicle: Name = NOBODY
     """The vehicle that has broken down or is passing, if any."""
     stands: bool = False
@@ -122,7 +124,7 @@ class Obstacles:
 
     def __bool__(self) -> bool:
         """Return whether there are obstacles, or will be."""
-        return bool(self._pending or self.active or self.passing)
+        return bool(self._pending or self.active or self.passing or self._clearing)
 
     @property
     def closed(self) -> tuple[TemporaryClosure, ...]:
@@ -205,7 +207,9 @@ class Obstacles:
                 elif self.in_the_way(part, vehicles).allow_closing(waits=waits):
                     self._pending.remove(cause)
                     part = self._with_room(part, vehicles)
-                    self.active.append(ActiveObstacle(CLOSED, part, t_s, cause.until_s))
+                    until_s = min(cause.until_s, t_s + cause.for_s)
+                    closed = ActiveObstacle(CLOSED, part, t_s, until_s, event=cause)
+                    self.active.append(closed)
                 else:
                     self._clearing.append(cause)
             elif (vehicle := self._found(cause, vehicles, t_s)) is not None:
@@ -218,6 +222,22 @@ class Obstacles:
                 self.active.append(obstacle)
                 vehicle.controller.broken_mps2 = cause.decel_mps2
                 yield vehicle
+
+    def request(self, event: RoadEvent) -> None:
+        """Close a part of a lane as soon as it has been cleared."""
+        self._pending.append(event)
+
+    def is_pending(self, event: RoadEvent) -> bool:
+        """Return whether a part is still to be closed."""
+        return any(one is event for one in self._pending)
+
+    def withdraw(self, event: RoadEvent) -> None:
+        """Do not close a part that is still to be closed."""
+        self._pending = [one for one in self._pending if one is not event]
+
+    def closed_for(self, event: RoadEvent) -> ActiveObstacle | None:
+        """Return the part that was closed for an event, if it is closed."""
+        return next((one for one in self.active if one.event is event), None)
 
     def in_the_way(
         self, part: TemporaryClosure, vehicles: Mapping[Name, RoadVehicle]

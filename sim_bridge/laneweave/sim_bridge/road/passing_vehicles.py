@@ -127,7 +127,7 @@ class PassingVehicles:
         return (*(each for each in own if each is not None), *self._announced.values())
 
     @property
-    def states(self) -> dict[Name, State]:
+    def states(self) -> dict[str, State]:
         """State of each vehicle: (s, v, a, y, v_y, a_y)."""
         lattice = self._scenario.lattice
         return {
@@ -156,7 +156,8 @@ class PassingVehicles:
         """Let vehicles enter and leave, and update what is closed and cleared for them."""
         end_m = self._scenario.road.length_m
         for one in list(self.on_road):
-            if one.s_m >= end_m or t_s >= one.passage.until_s:
+            until_s = min(one.passage.until_s, one.since_s + one.passage.for_s)
+            if one.s_m >= end_m or t_s >= until_s:
                 self.on_road.remove(one)
                 self._changes.append((PART_OPENED, one.recorded))
         for passage in [one for one in self._pending if t_s >= one.at_s]:

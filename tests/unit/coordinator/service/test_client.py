@@ -28,7 +28,7 @@ from laneweave.coordinator.service.client import (
     ServiceOverloadedError,
     ServiceUnavailableError,
 )
-from laneweave.coordinator.service.format import (
+from laneweave.protocol.runtime.queries import (
     CANCELLED,
     FAILED,
     INVALID,

@@ -17,15 +17,7 @@ from hypothesis import strategies as st
 from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.coordinator.planning.solve import plan
 from laneweave.coordinator.service import refusals
-from laneweave.coordinator.service.format import (
-    CANCEL_SCHEMA,
-    CANCELLED,
-    FAILED,
-    INVALID,
-    LATE,
-    OVERLOADED,
-    cancel_request,
-)
+from laneweave.coordinator.service.cancellation import CANCEL_SCHEMA, cancel_request
 from laneweave.coordinator.service.pending import ClientSession
 from laneweave.coordinator.service.rendezvous import is_assigned_to
 from laneweave.coordinator.service.server import PlanningService, ServiceMetrics
@@ -38,6 +30,13 @@ from laneweave.protocol.runtime.node import (
     Reply,
     StopJob,
     run_delegated,
+)
+from laneweave.protocol.runtime.queries import (
+    CANCELLED,
+    FAILED,
+    INVALID,
+    LATE,
+    OVERLOADED,
 )
 from laneweave.protocol.scenario.deployment_fields import Service
 

@@ -1,4 +1,4 @@
-"""Encoding of requests and answers as JSON or MessagePack; answers use their request's encoding."""
+"""Queries and their answers as maps in JSON or MessagePack; answers use their query's encoding."""
 
 from __future__ import annotations
 
@@ -6,34 +6,32 @@ import codecs
 import json
 import math
 from collections.abc import Callable
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 import msgpack
 from attrs import frozen
 
-from laneweave.coordinator.planning.response import PlanResponse
 from laneweave.protocol.errors import BadInputError, one_line
 from laneweave.protocol.runtime.node import Reply
 
 INVALID: Final = "invalid"
 """The request is not valid; sending it again does not help."""
 OVERLOADED: Final = "overloaded"
-"""The coordinator is overloaded; sending the request again later may help."""
+"""The server is overloaded; sending the request again later may help."""
 LATE: Final = "late"
 """The deadline passed before a worker was free."""
 CANCELLED: Final = "cancelled"
 """The client has cancelled the request."""
 FAILED: Final = "failed"
-"""Planning failed because of an error in the service."""
-CODES: Final = (INVALID, OVERLOADED, LATE, CANCELLED, FAILED)
-
-CANCEL_SCHEMA: Final = "laneweave.plan.cancel/1"
-"""Schema of a cancellation: a map with `schema` and the `id` of the request to cancel."""
+"""It failed because of an error in the server."""
+REFUSED: Final = "refused"
+"""It is not possible now."""
+CODES: Final = (INVALID, OVERLOADED, LATE, CANCELLED, FAILED, REFUSED)
 
 
 @frozen
 class Refusal:
-    """Error reply: the reason why there is no plan."""
+    """Error reply: the reason why the request is not fulfilled."""
 
     code: str
     """One of `CODES`."""
@@ -67,9 +65,11 @@ def _seconds(value: object) -> float | None:
     return None
 
 
-def cancel_request(request_id: str) -> dict[str, Any]:
-    """Return the cancellation of a request as a map."""
-    return {"schema": CANCEL_SCHEMA, "id": request_id}
+class Answer(Protocol):
+    """Answer to a query, which can be sent as a map."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the answer as a map."""
 
 
 @frozen
@@ -100,17 +100,9 @@ class Format:
             raise BadInputError(name, type(data).__name__, f"a map in {self.encoding}")
         return data
 
-    def read_cancelled_id(self, payload: bytes) -> str:
-        """Return the id of the request that a payload cancels; empty if it is no cancellation."""
-        try:
-            data = self.read(payload)
-        except BadInputError:
-            return ""
-        return str(data.get("id", "")) if data.get("schema") == CANCEL_SCHEMA else ""
-
-    def reply(self, token: int, answer: PlanResponse | Refusal) -> Reply:
+    def reply(self, token: int, answer: Answer) -> Reply:
         """Return the effect that answers a query."""
-        ok = isinstance(answer, PlanResponse)
+        ok = not isinstance(answer, Refusal)
         return Reply(token, self.write(answer.to_dict()), ok=ok, encoding=self.encoding)
 
 

@@ -1,0 +1,177 @@
+"""Vehicles of other systems on a road that no agent drives."""
+
+from __future__ import annotations
+
+import math
+from random import Random
+
+import pytest
+from attrs import evolve
+
+from laneweave.protocol.scenario.road_tables import Demand, RoadEvent
+from laneweave.protocol.wire.events import PART_CLOSED, PART_OPENED
+from laneweave.protocol.wire.messages import Name
+from laneweave.protocol.wire.obstacle_messages import PASSING, Obstacle
+from laneweave.sim_bridge.road.passing_vehicles import (
+    CLEARED_BEHIND_M,
+    PassingVehicle,
+    gap_needed_m,
+)
+from support import road_bugs
+from support.bugs import Bug, catches
+from support.closed_lanes import LonelyRoad, road_with
+from support.variants import variants
+
+ROAD = road_with(s3_m=850.0)
+TICK_S = ROAD.runtime.tick_s
+SLOW = RoadEvent(1, 300.0, 307.0, 20.0, speed_mps=5.0)
+FAST = RoadEvent(1, 0.0, 8.0, 20.0, speed_mps=25.0)
+
+
+def passing(event: RoadEvent, speed_mps: float) -> PassingVehicle:
+    return PassingVehicle(Name("other-1"), event, 0.0, event.to_m, speed_mps)
+
+
+def lonely_road(*events: RoadEvent, volume: float = 800.0, seed: int = 1) -> LonelyRoad:
+    demand = Demand(volume_veh_per_lane_h=volume, duration_s=60.0)
+    road = evolve(ROAD.road, events=events)
+    return LonelyRoad(evolve(ROAD, demand=demand, seed=seed, road=road))
+
+
+def run_to_end(road: LonelyRoad, within_s: float = 600.0) -> list[tuple[float, str, Obstacle]]:
+    changes = []
+    while road.vehicles or road.roadside.obstacles or not road.roadside.demand.exhausted(road.t_s):
+        t_s = road.t_s
+        road.step()
+        assert road.t_s < within_s, f"still on the road: {sorted(road.vehicles)}"
+        assert road.overlaps == []
+        check_parts(road)
+        changes += [(t_s, *change) for change in road.roadside.pop_obstacle_changes()]
+    return changes
+
+
+def check_parts(road: LonelyRoad) -> None:
+    """Check that what is published fits the vehicles on the road."""
+    obstacles = road.roadside.obstacles
+    lattice_mps = road.scenario.lattice.speed_mps
+    for one in obstacles.passing.on_road:
+        slow = [each.part for each in obstacles.active if each.vehicle == one.name]
+        fast = [each for each in obstacles.cleared if each.vehicle == one.name]
+        if one.passage.speed_mps < lattice_mps:
+            # The vehicle is within the newest of the parts that are closed for it.
+            assert not fast
+            assert any(part.from_m <= one.s_m and one.s_m <= part.to_m for part in slow)
+        elif fast:
+            assert not slow
+            (cleared,) = fast
+            moved_m = cleared.speed_mps * (road.t_s - cleared.at_s)
+            assert abs(cleared.front_m + moved_m - one.s_m) < 10.0
+            assert cleared.from_m <= cleared.front_m - cleared.length_m - CLEARED_BEHIND_M
+            assert cleared.to_m >= cleared.front_m + gap_needed_m(
+                one.passage.speed_mps, lattice_mps
+            )
+
+
+@pytest.mark.parametrize(
+    ("speed_mps", "volume", "seed"),
+    variants([(5.0, 800.0, 1), (10.0, 1200.0, 2), (0.5, 500.0, 3), (14.9, 1000.0, 4)], 2),
+)
+def test_a_slow_vehicle_is_an_obstacle_that_moves(
+    speed_mps: float, volume: float, seed: int
+) -> None:
+    # It turns off before the end of the road, so that a very slow one does not take all day.
+    event = evolve(SLOW, speed_mps=speed_mps, for_s=60.0)
+    road = lonely_road(event, volume=volume, seed=seed)
+    changes = run_to_end(road)
+    (entered_s, first, entered), (left_s, second, left) = changes
+    assert (first, second) == (PART_CLOSED, PART_OPENED)
+    assert (entered.cause, entered.lane, entered.vehicle) == (PASSING, 1, "other-1")
+    assert entered_s >= 20.0
+    # It is not slower than those that wait ahead of it.
+    travels_s = min(60.0, (road.scenario.road.length_m - event.to_m) / speed_mps)
+    assert travels_s - 1.0 < left_s - entered_s <= 60.1
+    assert 0.7 * speed_mps < left.speed_mps <= speed_mps
+
+
+@pytest.mark.parametrize(("speed_mps", "seed"), variants([(25.0, 1), (16.0, 2), (40.0, 3)], 2))
+def test_a_fast_vehicle_brakes_for_those_that_do_not_leave_its_lane(
+    speed_mps: float, seed: int
+) -> None:
+    road = lonely_road(evolve(FAST, speed_mps=speed_mps), seed=seed)
+    changes = run_to_end(road)
+    (entered_s, _, _), (left_s, _, left) = changes
+    # Nobody plans here, so that it drives behind the others, at v_F.
+    assert left.speed_mps <= 15.1
+    assert left_s - entered_s < (road.scenario.road.length_m / 15.0) * 1.5
+    assert max(road.events, default=None) is None
+
+
+def test_no_vehicle_enters_a_lane_that_is_cleared() -> None:
+    road = lonely_road(FAST, volume=1500.0)
+    entered: dict[Name, float] = {}
+    while road.t_s < 60.0:
+        road.step()
+        for name, vehicle in road.vehicles.items():
+            if vehicle.cell[1] == 1:
+                entered.setdefault(name, road.t_s)
+    on_road = road.roadside.obstacles.passing.on_road
+    assert len(on_road) == 1
+    since_s = on_road[0].since_s
+    # Between the announcement and the passage; before and after, vehicles enter all the time.
+    during = [t_s for t_s in entered.values() if 20.2 < t_s < since_s + 0.5]
+    assert during == []
+    assert since_s > 22.0
+    assert any(t_s < 20.0 for t_s in entered.values())
+    assert any(t_s > since_s + 0.5 for t_s in entered.values())
+
+
+def test_a_vehicle_alone_keeps_its_speed() -> None:
+    vehicle = passing(FAST, 25.0)
+    for _ in range(100):
+        vehicle.step(math.inf, 0.0, TICK_S)
+    assert vehicle.speed_mps == vehicle.lowest_mps == 25.0
+    assert vehicle.s_m == pytest.approx(8.0 + 100 * TICK_S * 25.0)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_a_vehicle_never_touches_one_ahead_that_brakes(seed: int) -> None:
+    rng = Random(seed)
+    speed_mps, lead_mps = rng.uniform(0.0, 40.0), rng.uniform(0.0, 40.0)
+    vehicle = passing(evolve(FAST, speed_mps=40.0), speed_mps)
+    lead_m = vehicle.s_m + gap_needed_m(speed_mps, lead_mps)
+    for _ in range(1000):
+        decel_mps2 = rng.choice([0.0, 0.0, 4.0])
+        slower_mps = max(lead_mps - decel_mps2 * TICK_S, 0.0)
+        lead_m += 0.5 * (lead_mps + slower_mps) * TICK_S
+        lead_mps = slower_mps
+        vehicle.step(lead_m - vehicle.s_m, lead_mps, TICK_S)
+        assert vehicle.s_m <= lead_m
+        assert vehicle.accel_mps2 >= -9.0 - 1e-9
+
+
+def test_the_gap_from_which_a_vehicle_does_not_brake() -> None:
+    for gap_m, brakes in ((gap_needed_m(25.0, 15.0) + 1.0, False), (70.0, True)):
+        vehicle = passing(FAST, 25.0)
+        vehicle.step(gap_m, 15.0, TICK_S)
+        assert (vehicle.speed_mps < 25.0) is brakes
+
+
+BUGS: tuple[Bug, ...] = (
+    road_bugs.closed_parts_do_not_move, road_bugs.others_brake_for_nobody,
+    road_bugs.others_enter_without_room, road_bugs.cleared_lanes_are_entered,
+)  # fmt: skip
+
+
+def check_all() -> None:
+    run_to_end(lonely_road(evolve(SLOW, for_s=60.0)))
+    run_to_end(lonely_road(FAST))
+    test_no_vehicle_enters_a_lane_that_is_cleared()
+
+
+@pytest.mark.parametrize(
+    "bug", [pytest.param(bug, marks=catches(bug), id=bug.name) for bug in BUGS]
+)
+def test_planted_bugs_are_noticed(bug: Bug, monkeypatch: pytest.MonkeyPatch) -> None:
+    bug.plant(monkeypatch)
+    with pytest.raises(AssertionError):
+        check_all()
