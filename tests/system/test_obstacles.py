@@ -80,6 +80,43 @@ def test_a_part_that_is_closed_ahead_stops_nobody_and_is_used_again(tmp_path: Pa
     assert 45.0 <= min(in_part) <= 55.0
 
 
+def mean_s(found: RunSummary) -> float:
+    assert found.travel_time_s.mean is not None
+    return found.travel_time_s.mean
+
+
+@pytest.mark.parametrize(
+    ("from_m", "speed_mps"), [(500.0, 6.0), pytest.param(500.0, 10.0, marks=pytest.mark.more)]
+)
+def test_the_others_pass_a_slow_vehicle(tmp_path: Path, from_m: float, speed_mps: float) -> None:
+    event = {"lane": 1, "from_m": from_m, "to_m": from_m + 7.0, "at_s": 30.0, "for_s": 30.0}
+    found = run(tmp_path / "run", road__events=(event | {"speed_mps": speed_mps},))
+    alone = run(tmp_path / "alone")
+    assert found.vehicles.left == found.vehicles.demanded
+    assert found.obstacles is not None
+    (obstacle,) = found.obstacles
+    assert (obstacle.cause, obstacle.vehicle) == ("passing", "other-1")
+    assert obstacle.lowest_speed_mps == speed_mps
+    assert obstacle.stopped <= 6
+    assert mean_s(found) - mean_s(alone) < 4.0
+
+
+@pytest.mark.parametrize("loss", [0.0, pytest.param(0.3, marks=pytest.mark.more)])
+def test_the_lane_is_cleared_before_a_fast_vehicle(tmp_path: Path, loss: float) -> None:
+    event = {"lane": 1, "from_m": 0.0, "to_m": 7.0, "at_s": 30.0, "speed_mps": 25.0}
+    faults = {"messages": [{"loss": loss}]} if loss else None
+    found = run(tmp_path / "run", faults, road__events=(event,))
+    assert found.obstacles is not None
+    (obstacle,) = found.obstacles
+    assert obstacle.stopped == 0
+    assert found.vehicles.left == found.vehicles.demanded
+    assert obstacle.opened_s is not None
+    # At 25 m/s the road takes 36 s, at the speed of the others 60 s.
+    assert obstacle.opened_s - obstacle.since_s < 42.0
+    assert obstacle.lowest_speed_mps is not None
+    assert obstacle.lowest_speed_mps > 18.0
+
+
 @pytest.mark.more
 def test_equal_seeds_give_equal_runs(tmp_path: Path) -> None:
     faults = {"breakdown": [{"at_s": 20.0, "count": 2, "for_s": 10.0}]}

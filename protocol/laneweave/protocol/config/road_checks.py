@@ -51,7 +51,8 @@ def check_events(scenario: Scenario) -> None:
         allowed = f"more than from_m, {event.from_m:g}"
         require(event.to_m > event.from_m, f"{name}.to_m", event.to_m, allowed)
         allowed = f"more than at_s, {event.at_s:g}"
-        require(event.until_s > event.at_s, f"{name}.until_s", event.until_s, allowed)
+        until_s = event.until_s
+        require(until_s is None or until_s > event.at_s, f"{name}.until_s", until_s, allowed)
         if event.speed_mps:
             _check_passage(scenario, name, event)
         else:

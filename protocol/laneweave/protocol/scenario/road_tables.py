@@ -8,7 +8,7 @@ from typing import Final
 
 from attrs import field, frozen
 
-from laneweave.protocol.field_validators import key_part, one_of, within
+from laneweave.protocol.field_validators import key_part, one_of, within, within_or_none
 from laneweave.protocol.road_layout import LONGEST_ROAD_M, LaneChange, LaneSection
 
 MAIN_ENTRANCE: Final = "main"
@@ -42,15 +42,20 @@ class RoadEvent:
     to_m: float = field(validator=within(0.0, LONGEST_ROAD_M))
     at_s: float = field(validator=within(0.0, 1e6))
     """Road time from which it is closed."""
-    until_s: float = field(default=math.inf, validator=within(0.0, math.inf))
+    until_s: float | None = field(default=None, validator=within_or_none(0.0, 1e6))
     """Road time until which it is closed; by default, for ever."""
-    for_s: float = field(default=math.inf, validator=within(0.0, math.inf))
+    for_s: float | None = field(default=None, validator=within_or_none(0.0, 1e6))
     """Time after which it is opened again, unless `until_s` is earlier."""
     speed_mps: float = field(default=0.0, validator=within(0.0, 60.0))
     """Speed of a vehicle of another system; 0: a closed part."""
     clear_s: float = field(default=20.0, validator=within(0.0, 600.0))
     """Time for which the lane is cleared at most, until nobody need brake hard for the part, or
     for the vehicle that enters."""
+
+    def ends_s(self, since_s: float) -> float:
+        """Return the road time at which it ends if it has begun at a time; infinite: never."""
+        until_s = math.inf if self.until_s is None else self.until_s
+        return until_s if self.for_s is None else min(until_s, since_s + self.for_s)
 
 
 @frozen

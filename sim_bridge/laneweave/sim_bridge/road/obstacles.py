@@ -202,13 +202,12 @@ class Obstacles:
             if isinstance(cause, RoadEvent):
                 waits = t_s < cause.at_s + cause.clear_s
                 part = TemporaryClosure(cause.lane, cause.from_m, cause.to_m)
-                if t_s >= cause.until_s:
+                if t_s >= cause.ends_s(t_s):
                     self._pending.remove(cause)
                 elif self.in_the_way(part, vehicles).allow_closing(waits=waits):
                     self._pending.remove(cause)
                     part = self._with_room(part, vehicles)
-                    until_s = min(cause.until_s, t_s + cause.for_s)
-                    closed = ActiveObstacle(CLOSED, part, t_s, until_s, event=cause)
+                    closed = ActiveObstacle(CLOSED, part, t_s, cause.ends_s(t_s), event=cause)
                     self.active.append(closed)
                 else:
                     self._clearing.append(cause)

@@ -156,8 +156,7 @@ class PassingVehicles:
         """Let vehicles enter and leave, and update what is closed and cleared for them."""
         end_m = self._scenario.road.length_m
         for one in list(self.on_road):
-            until_s = min(one.passage.until_s, one.since_s + one.passage.for_s)
-            if one.s_m >= end_m or t_s >= until_s:
+            if one.s_m >= end_m or t_s >= one.passage.ends_s(one.since_s):
                 self.on_road.remove(one)
                 self._changes.append((PART_OPENED, one.recorded))
         for passage in [one for one in self._pending if t_s >= one.at_s]:

@@ -135,7 +135,7 @@ class RoadDesk:
             from_m=request.from_m,
             to_m=request.to_m,
             at_s=t_s,
-            for_s=math.inf if request.for_s is None else request.for_s,
+            for_s=request.for_s,
             clear_s=request.clear_s,
         )
 

@@ -61,6 +61,7 @@ def ends_at(end_m: float) -> Callable[[Tables], object]:
 
 
 PART = {"from_m": 400.0, "to_m": 450.0, "at_s": 5.0}
+OTHER = {"from_m": 400.0, "to_m": 407.0, "at_s": 5.0, "speed_mps": 5.0}
 """An event of the road, but for its lane."""
 
 
@@ -133,6 +134,10 @@ PART = {"from_m": 400.0, "to_m": 450.0, "at_s": 5.0}
                 ({"lane": 1} | PART | {"to_m": 300.0}, "road.events[0].to_m: got 300.0; allowed: "),
                 ({"lane": 1} | PART | {"until_s": 5.0}, "road.events[0].until_s: got 5.0; allowed"),
                 ({"lane": 1} | PART | {"to_m": 9e3}, "road.events[0].from_m: got 400.0; allowed: "),
+                ({"lane": 0} | OTHER, "road.events[0].lane: got 0; allowed: a lane without ends"),
+                ({"lane": 1} | OTHER | {"to_m": 450.0}, "road.events[0].to_m: got 450.0; allowed"),
+                ({"lane": 1} | OTHER | {"from_m": 9.0, "to_m": 9.5}, "road.events[0].from_m: got"),
+                ({"lane": 1} | OTHER | {"speed_mps": 99.0}, "road.events[0].speed_mps: got 99.0"),
             )
         ),
         (

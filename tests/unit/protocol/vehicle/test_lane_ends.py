@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from random import Random
 
 import pytest
 from attrs import evolve
@@ -13,7 +14,14 @@ from msgspec.structs import replace
 from laneweave.agents.driving.reference import Reference
 from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.road_layout import ANY_LANE, LaneSection, open_sections, sections_for
+from laneweave.protocol.road_layout import (
+    ANY_LANE,
+    ClearedPart,
+    LaneSection,
+    TemporaryParts,
+    open_sections,
+    sections_for,
+)
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.road_tables import Closure, Exit
 from laneweave.protocol.vehicle.lane_ends import (
@@ -94,6 +102,35 @@ def test_the_dead_end_ahead_is_that_of_the_section(
 ) -> None:
     end = LaneEnds(BLOCKED).ahead(lane, s_m)
     assert (end.end_m if end is not None else None) == end_m
+
+
+@pytest.mark.parametrize("speed_mps", [0.0, 5.0, 15.0, 25.0])
+@pytest.mark.parametrize("seed", range(10))
+def test_a_lane_change_enters_a_cleared_part_if_the_body_is_ever_beside_it(
+    speed_mps: float, seed: int
+) -> None:
+    rng, lattice = Random(seed), ROLLING.lattice
+    length_m = ROLLING.types.longest_body_m
+    for _ in range(50):
+        from_m = rng.uniform(0.0, 500.0)
+        part = ClearedPart(1, from_m, from_m + rng.uniform(1.0, 200.0), speed_mps, 10.0)
+        ends = LaneEnds(ROLLING, TemporaryParts(cleared=(part,)))
+        assert ends
+        column, t_s, takes_s = rng.randrange(-10, 30), rng.uniform(5.0, 20.0), rng.uniform(1.0, 6.0)
+        origin = column, rng.choice([0, 2])
+        target = column + rng.choice([-1, 0, 1]), 1
+        columns = min(origin[0], target[0]), max(origin[0], target[0])
+        beside = False
+        for step in range(101):
+            at_s = t_s + takes_s * step / 100.0
+            first_m, last_m = part.at(at_s)
+            rear_m = lattice.cell_s_m(columns[0], at_s) - length_m
+            beside |= rear_m < last_m and lattice.cell_s_m(columns[1], at_s) > first_m
+        assert ends.enters_cleared(origin, target, t_s, takes_s) is beside
+        assert not beside or ends.too_late(origin, target, t_s, takes_s)
+        # Out of it, or within the lane, they may move.
+        assert not ends.enters_cleared(target, origin, t_s, takes_s)
+        assert not ends.enters_cleared((column, 1), (column + 1, 1), t_s, takes_s)
 
 
 def test_cells_pass_the_line_with_the_lattice() -> None:

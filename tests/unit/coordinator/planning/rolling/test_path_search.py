@@ -16,6 +16,7 @@ from laneweave.coordinator.planning.rolling import search_kernel as kernel
 from laneweave.coordinator.planning.rolling.arrays import window
 from laneweave.coordinator.planning.rolling.path_search import StreamPlanner
 from laneweave.coordinator.planning.rolling.problem import (
+    MovingPart,
     OpenRoad,
     StreamCosts,
     StreamPlan,
@@ -23,6 +24,7 @@ from laneweave.coordinator.planning.rolling.problem import (
     StreamVehicle,
 )
 from laneweave.coordinator.planning.rolling.rolling_validator import problems_of_plan
+from laneweave.protocol.lattice import Cell
 from laneweave.protocol.road_layout import LaneSection
 from support import rolling_oracles as oracle
 from support.examples import examples
@@ -316,6 +318,53 @@ def test_lanes_are_changed_earlier_while_a_part_is_closed() -> None:
     assert StreamPlanner(early).plan(0, [vehicle]).paths["a"][1] == (10, 1)
     plan = StreamPlanner(early).plan(0, [vehicle], now=OpenRoad(CLOSED_AT_700))
     assert plan.paths["a"][1][1] == 0
+
+
+FASTER = MovingPart(1, 100.0, 300.0, 90.0)
+"""Cleared for a vehicle that gains 30 m in a slot on the lattice."""
+
+
+def touches(part: MovingPart, road: StreamRoad, slot: int, cell: Cell) -> bool:
+    """Return whether a body is in a moving part when a slot begins, or half a slot later."""
+    for share in (0.0, 0.5, 1.0):
+        front_m = road.position_m(0, cell[0]) + (slot + share) * road.advance_m
+        moved_m = (slot + share) * part.advance_m
+        if front_m > part.from_m + moved_m and front_m - road.body_m < part.to_m + moved_m:
+            return cell[1] == part.lane
+    return False
+
+
+@pytest.mark.parametrize("advance_m", [0.0, 30.0, 60.0, 90.0])
+def test_vehicles_leave_a_part_that_is_cleared_and_none_enters_it(advance_m: float) -> None:
+    part = evolve(FASTER, advance_m=advance_m)
+    road = evolve(lanes(*through(0, 1, 2)), lanes=3)
+    now = OpenRoad(road.sections, cleared=(part,))
+    inside = [StreamVehicle(f"in-{column}", (column, 1), 1) for column in (11, 13, 16)]
+    beside = [StreamVehicle(f"beside-{column}", (column, 0), 1) for column in (12, 14)]
+    plan = StreamPlanner(road).plan(0, [*inside, *beside], now=now)
+    assert problems_of_plan(road.as_open(now), plan, [*inside, *beside], frozenset()) == []
+    for name, path in plan.paths.items():
+        was_in = False
+        for slot, cell in enumerate(path):
+            is_in = touches(part, road, slot, cell)
+            # They leave it with their first move; nobody enters it.
+            assert not is_in or (name.startswith("in") and slot == 0) or not was_in
+            assert not is_in or slot == 0
+            was_in = is_in
+    if advance_m >= 60.0:
+        return  # the part does not fall behind
+    assert plan.missed == ()  # all return to their lane once it has fallen behind
+
+
+def test_a_plan_that_enters_a_cleared_part_is_invalid() -> None:
+    road = evolve(lanes(*through(0, 1, 2)), lanes=3)
+    vehicle = StreamVehicle("a", (12, 0), 1)
+    plan = StreamPlanner(road).plan(0, [vehicle])
+    assert plan.paths["a"][1] == (12, 1)
+    assert list(problems_of_plan(road, plan, [vehicle], frozenset())) == []
+    now = road.as_open(OpenRoad(road.sections, cleared=(FASTER,)))
+    (problem,) = problems_of_plan(now, plan, [vehicle], frozenset())
+    assert "from lane 0 to 1" in problem
 
 
 @pytest.mark.slow
