@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +18,8 @@ from laneweave.protocol.wire.events import (
     PART_OPENED,
     STREAM_PLANNED,
 )
-from support.harness import Lab, check_safe_and_complete, events, summary
+from support.deployments import deployment, free_tcp, start_router, stop
+from support.harness import Ended, Lab, check_safe_and_complete, events, summary
 
 ROAD = {
     "road": {"s1_m": 50.0, "s2_m": 100.0, "s3_m": 750.0},
@@ -169,3 +172,72 @@ vehicles_per_process = 1
     assert found["vehicles"]["left"] == found["vehicles"]["demanded"]
     (obstacle,) = found["obstacles"]
     assert obstacle["opened_s"] >= obstacle["since_s"] + 20.0
+
+
+@pytest.mark.more
+def test_an_operator_closes_a_lane_and_opens_it_again(lab: Lab) -> None:
+    text = """seed = 3
+[road]
+s1_m = 50.0
+s2_m = 100.0
+s3_m = 750.0
+[demand]
+volume_veh_per_lane_h = 900.0
+duration_s = 60.0
+[formation]
+operation = "rolling"
+[tracking]
+shortcut = true
+[runtime]
+vehicles_per_process = 40
+max_pace = 3.0
+"""
+    road, folder = lab.path("road.toml", text), lab.folder / "run"
+    run = lab.start("run", road, "--out", folder, "--no-progress", "--pace", "3")
+    lab.wait_until(lambda: bool(list(lab.sockets.glob("laneweave-*/router.sock"))))
+    at = ("--config", road, "--endpoint", lab.router_endpoint)
+    lab.wait_until(lambda: road_time_s(lab, at) > 1.0)
+    part = ("--lane", 1, "--from", 600, "--to", 650)
+    closed = beside(lab, "road", "close", *part, *at)
+    assert closed.status == 0, closed
+    assert "lane 1, 600 to 650 m, is closed from" in closed.out
+    again = beside(lab, "road", "close", *part, *at)
+    assert again.status == 2
+    assert "lane 1 is not, 600 to 650 m (closed)" in again.err
+    lab.wait_until(lambda: road_time_s(lab, at) > 25.0)
+    opened = beside(lab, "road", "open", "--lane", 1, *at)
+    assert opened.status == 0, opened
+    assert "lane 1, 600 to 650 m, is open again" in opened.out
+    nothing = beside(lab, "road", "open", "--lane", 2, *at)
+    assert (nothing.status, nothing.err) == (1, "no part of lane 2 is closed there\n")
+    ended = lab.finish(run)
+    assert ended.status == 0, ended
+    check_safe_and_complete(folder)
+    (obstacle,) = summary(folder)["obstacles"]
+    assert (obstacle["cause"], obstacle["from_m"]) == ("closed", 600.0)
+    assert obstacle["opened_s"] > 20.0
+
+
+def beside(lab: Lab, *arguments: object) -> Ended:
+    """Run a command while other processes of the test run."""
+    return lab.run_forked(*arguments, alone=False)
+
+
+def road_time_s(lab: Lab, at: Iterable[object]) -> float:
+    """Return the road time that `laneweave status` reports."""
+    found = beside(lab, "status", *at, "--seconds", 0.5, "--json")
+    road = json.loads(found.out)["road"] if found.out else None
+    return float(road["t_s"]) if road else 0.0
+
+
+def test_a_request_without_a_bridge_or_router_ends_with_one_line(lab: Lab) -> None:
+    part = ("--lane", 1, "--from", 600, "--to", 650)
+    nobody = beside(lab, "road", "close", *part, "--endpoint", free_tcp())
+    assert (nobody.status, len(nobody.err.splitlines())) == (2, 1)
+    endpoint = free_tcp()
+    config = deployment(lab, endpoint)
+    router = start_router(lab, config)
+    ended = beside(lab, "road", "close", *part, "--config", config)
+    assert (ended.status, ended.out) == (1, "")
+    assert ended.err.startswith(f"no bridge answers at {endpoint}, realm ")
+    stop(lab, router)

@@ -38,6 +38,7 @@ from laneweave.protocol.wire.topics import (
     PLAN,
     PREPARE,
     REPORT,
+    ROAD_REQUEST,
     SENSE,
     SERVICE,
     STATE,
@@ -68,7 +69,7 @@ FLEETS = {one: f"fleet.agents-{1 if Shard(0, 2).contains(one) else 2}" for one i
 STRANGERS = ("client.stranger", "vehicle.stranger")
 """They have certificates of the right authority, but the deployment does not know them."""
 MEMBERS = ("bridge", "coordinator.c1", "coordinator.c3", f"vehicle.{A}", f"vehicle.{B}",
-           "fleet.agents-1", "fleet.agents-2", "client.plan", "observer.watch",
+           "fleet.agents-1", "fleet.agents-2", "client.plan", "operator.operator", "observer.watch",
            *STRANGERS)  # fmt: skip
 
 
@@ -266,6 +267,19 @@ def test_only_coordinators_serve_and_only_clients_ask(network: Network) -> None:
     for who in ("bridge", f"vehicle.{A}", "fleet.agents-1", "observer.watch", *STRANGERS):
         assert answer_to(network.join(who), key, timeout_s=0.1) == b""
     assert answer_to(client, key) == b"coordinator.c1"
+
+
+def test_only_operators_change_the_road(network: Network) -> None:
+    key = KEYS.key(ROAD_REQUEST)
+    network.serve("bridge", key)
+    operator = network.join("operator.operator")
+    wait_until(lambda: answer_to(operator, key) == b"bridge", COME_S)
+    for who in ("coordinator.c1", f"vehicle.{A}", "client.plan", "observer.watch", *STRANGERS):
+        assert answer_to(network.join(who), key, timeout_s=0.1) == b""
+    for who in ("coordinator.c1", f"vehicle.{A}", "operator.operator"):
+        network.serve(who, key)
+    time.sleep(QUIET_S)
+    assert answer_to(operator, key) == b"bridge"
 
 
 def test_a_query_has_the_name_of_its_clients_certificate(network: Network) -> None:

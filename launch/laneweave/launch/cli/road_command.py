@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import time
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -28,6 +29,8 @@ road = typer.Typer(
 
 ANSWER_S = 10.0
 """Time within which the bridge answers a request that does not wait for vehicles."""
+FIND_S, PAUSE_S = 1.0, 0.05
+"""Time for which a bridge is looked for; pause between two queries."""
 LONGEST_WAIT_S = 3600.0
 
 Lane = Annotated[int, typer.Option("--lane", metavar="N", help="Lane; 0 is the rightmost.")]
@@ -132,12 +135,16 @@ def ask(settings: Scenario, name: str, request: RoadRequest) -> RoadResponse:
     with contextlib.closing(connect_blocking(access, lambda _: None)) as transport:
         key = Keys(network.realm).key(ROAD_REQUEST)
         payload = JSON.write(request.to_dict())
-        try:
-            answer = transport.query(key, payload, wait_s, JSON.encoding).result()
-        except TimeoutError:
-            raise CommandFailedError(
-                f"the bridge at {where} has not answered within {wait_s:g} s"
-            ) from None
+        found_s = time.monotonic() + FIND_S
+        answer = None
+        while answer is None and time.monotonic() < found_s:
+            try:
+                answer = transport.query(key, payload, wait_s, JSON.encoding).result()
+            except TimeoutError:
+                text = f"the bridge at {where} has not answered within {wait_s:g} s"
+                raise CommandFailedError(text) from None
+            if answer is None:
+                time.sleep(PAUSE_S)
     if answer is None:
         raise CommandFailedError(f"no bridge answers at {where}")
     data = format_of(answer.payload, answer.encoding).read(answer.payload, "response")

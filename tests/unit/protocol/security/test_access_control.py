@@ -112,6 +112,14 @@ def test_tokens_and_the_service() -> None:
         assert not may(who, "ingress", "declare_queryable", "service/plan")
 
 
+def test_only_operators_change_the_road_and_only_the_bridge_serves_them() -> None:
+    key = "road/request"
+    everybody = "bridge coordinator.c1 vehicle.a fleet.two client.plan operator.operator"
+    for who in (*everybody.split(), "observer.watch"):
+        assert may(who, "ingress", "query", key) is (who == "operator.operator")
+        assert may(who, "ingress", "declare_queryable", key) is (who == "bridge")
+
+
 @for_each("flow", list(Flow))
 @for_each("message", ["delete", "put", "query", "declare_subscriber", "reply"])
 @for_each("key", ["**", "*", "clock/**", "../other", "@/router", "state/*/*/x"])
