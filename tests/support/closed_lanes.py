@@ -6,9 +6,11 @@ from attrs import define, evolve, field
 
 from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.road_layout import Exits
+from laneweave.protocol.runtime.node import Send
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.road_tables import Closure, DestinationShare, Road
 from laneweave.protocol.vehicle.motion import State
+from laneweave.protocol.wire.codec import decode, encode
 from laneweave.protocol.wire.messages import Name
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import Bodies, Pose, pose_of
 from laneweave.sim_bridge.road.demand import arrivals
@@ -101,6 +103,10 @@ class LonelyRoad:
             self.vehicles[vehicle.name] = vehicle
         for change in self.roadside.control_lane_ends(self.vehicles, t_s):
             self.events.append((t_s, change.kind, change.vehicle))
+        published = self.roadside.publish(self.tick, t_s, self.vehicles.values())
+        for effect in published:
+            # Receivers must be able to read it.
+            assert not isinstance(effect, Send) or decode(encode(effect.message)) == effect.message
         self.roadside.assign_empty_cells(self.vehicles)
         for vehicle in self.vehicles.values():
             vehicle.step(self.tick)

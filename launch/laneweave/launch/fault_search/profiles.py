@@ -59,6 +59,8 @@ class Profile:
     """Whether a lane ends, joins or leaves, as drawn (at the real roadside)."""
     interchanges: bool = False
     """Whether a lane leads to an exit, and ramps behind it join (rolling, at the roadside)."""
+    surprises: Span = (0, 0)
+    """Number of breakdowns, closed parts and vehicles of other systems (at the real roadside)."""
     density: tuple[float, float] = (0.3, 0.7)
     """Occupied share of the cells in which vehicles may enter (rolling operation)."""
     vehicles: Span = (2, 16)

@@ -11,6 +11,7 @@ from attrs import evolve, frozen
 
 from laneweave.launch.fault_search.events.lasting_faults import LEASE_S
 from laneweave.launch.fault_search.road.drawn_roads import STRAIGHT_ROAD, DrawnRoad
+from laneweave.launch.fault_search.road.drawn_surprises import NO_SURPRISES, Surprises
 from laneweave.protocol.scenario.deployment_fields import Network, Runtime
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.formation_table import FormationSettings
@@ -65,6 +66,7 @@ class RoadSetup:
     """Whether there are vehicles that do not change columns (at the roadside)."""
     drawn: DrawnRoad = STRAIGHT_ROAD
     """Closed parts, ramps and exits (at the real roadside)."""
+    surprises: Surprises = NO_SURPRISES
 
     def make_scenario(self) -> Scenario:
         """Return the scenario of the road."""
@@ -95,7 +97,14 @@ class RoadSetup:
             s3_m = 20_000.0
         drawn = self.drawn
         return Scenario(
-            road=Road(self.lanes, s1_m=0.0, s2_m=self.before_m, s3_m=s3_m, closures=drawn.closures),
+            road=Road(
+                self.lanes,
+                s1_m=0.0,
+                s2_m=self.before_m,
+                s3_m=s3_m,
+                closures=drawn.closures,
+                events=self.surprises.events,
+            ),
             entrance=drawn.entrance,
             exit=drawn.exit,
             vehicle_type=(TRUCK,) if self.trucks else (),
@@ -122,6 +131,6 @@ def draw_rolling_road(lanes: int, rng: random.Random, before_columns: int = 0) -
     return evolve(road, before_m=before_columns * road.make_scenario().lattice.pitch_m)
 
 
-def rng_of_types(road: RoadSetup, purpose: str) -> random.Random:
-    """Return a random generator for types alone: no other draw depends on them."""
+def own_rng(road: RoadSetup, purpose: str) -> random.Random:
+    """Return a random generator for one purpose alone: no other draw depends on it."""
     return random.Random(f"types/{purpose}/{road.seed}")  # noqa: S311 (simulation, no secrets)

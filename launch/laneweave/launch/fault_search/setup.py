@@ -26,6 +26,7 @@ from laneweave.launch.fault_search.road.drawn_roads import (
     draw_interchange,
     draw_road,
 )
+from laneweave.launch.fault_search.road.drawn_surprises import draw_surprises
 from laneweave.launch.fault_search.road.light_vehicle import Visit
 from laneweave.launch.fault_search.road_setup import (
     BLOCK_COLUMNS,
@@ -34,7 +35,7 @@ from laneweave.launch.fault_search.road_setup import (
     TRUCK,
     RoadSetup,
     draw_rolling_road,
-    rng_of_types,
+    own_rng,
 )
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.road_layout import END_OF_ROAD
@@ -183,13 +184,18 @@ class Setup:
                 seed = rng.randrange(2**31)
                 road = evolve(road, before_m=before_m, drawn=drawn, seed=seed)
         if profile.roads:
-            road = evolve(road, trucks=rng_of_types(road, "road").random() < WITH_TRUCKS)
+            road = evolve(road, trucks=own_rng(road, "road").random() < WITH_TRUCKS)
+        if profile.surprises[1]:
+            road = evolve(road, seed=road.seed or rng.randrange(2**31))
+            own = own_rng(road, "surprises")
+            count = own.randint(*profile.surprises)
+            road = evolve(road, surprises=draw_surprises(count, range(lanes), own))
         scenario = road.make_scenario()
         lasting = LastingFaults.drawn(profile, rng)
         mean_s = rng.uniform(*MEAN_HEADWAYS_S)
         points = scenario.geometry.entry_points
         next_s = {point: rng.uniform(0.0, mean_s) for point in scenario.flow.inflows}
-        visits, types_rng = [], rng_of_types(road, "vehicles")
+        visits, types_rng = [], own_rng(road, "vehicles")
         for number in range(1, rng.randint(*profile.vehicles) + 1):
             arrival_s, point = min((t_s, point) for point, t_s in next_s.items())
             next_s[point] += 1.0 + rng.expovariate(1.0 / mean_s)
@@ -234,7 +240,8 @@ class Setup:
             )
             for visit in sorted(self.visits, key=lambda visit: visit.enters_s)
         )
-        return Roadside(self.scenario, stream, bridge)
+        breakdowns = self.road.surprises.breakdowns
+        return Roadside(self.scenario, stream, bridge, breakdowns=breakdowns)
 
     def preferences(self, rng: random.Random, *, last: bool) -> dict[Name, int]:
         """Draw the preferred lane of each vehicle.

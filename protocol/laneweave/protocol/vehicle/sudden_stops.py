@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from laneweave.protocol.scenario.fields import Scenario
 
 BRAKING_MPS2 = 5.0
@@ -35,7 +37,10 @@ def room_before_part_m(scenario: Scenario, room_m: float) -> float:
 
 
 def begins_m(scenario: Scenario, lane: int, s_m: float) -> float:
-    """Return the last position up to `s_m` where a lane begins, or where vehicles enter it."""
+    """Return the last position up to `s_m` where a lane begins, or where vehicles enter it.
+
+    Before the start of the road, this is `s_m`.
+    """
     sections = (each.from_m for each in scenario.geometry.sections if each.lane == lane)
     entries = (each.at_m for each in scenario.geometry.entry_points if each.lane == lane)
-    return max((each for each in (*sections, *entries) if each <= s_m), default=s_m)
+    return max((each for each in (*sections, *entries) if -math.inf < each <= s_m), default=s_m)

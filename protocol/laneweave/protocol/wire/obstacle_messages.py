@@ -31,7 +31,7 @@ class Obstacle(Message, frozen=True):
     until_s: Real | None = None
     """Road time at which the cause ends; None: not known. Until nobody waits there any more, the
     part stays closed."""
-    vehicle: Name = Name("")
+    vehicle: Name | None = None
     """The vehicle that has broken down, or that is passing."""
     speed_mps: Real = 0.0
     """Speed of a vehicle that is passing."""
@@ -48,7 +48,7 @@ class Cleared(Message, frozen=True):
     at_s: Real
     cause: str = CLOSED
     """`closed`: it will be closed; `passing`: for a vehicle of another system."""
-    vehicle: Name = Name("")
+    vehicle: Name | None = None
     """This vehicle."""
     front_m: Real = 0.0
     """Where its front is at `at_s` [m]."""

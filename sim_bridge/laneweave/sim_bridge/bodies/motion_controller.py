@@ -313,7 +313,8 @@ class MotionController:
         self.command_tick = command.tick
         self.store_requests(command)
         t_s = command.tick * self.tick_s
-        if not leaves and command.motion.origin not in (self.hold_cell, self.motion.origin):
+        known = command.motion.origin in (self.hold_cell, self.motion.origin)
+        if not (leaves or known or self.off_lattice):  # a late command
             self.refusal = Refusal(Problem.MOVE)
             return False
         if leaves:

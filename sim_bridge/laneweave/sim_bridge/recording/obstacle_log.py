@@ -34,7 +34,7 @@ class ObstacleLog:
                     lane=obstacle.lane,
                     from_m=obstacle.from_m,
                     to_m=obstacle.to_m,
-                    vehicle=obstacle.vehicle,
+                    vehicle=obstacle.vehicle or "",
                     since_s=obstacle.since_s,
                 )
             )

@@ -47,7 +47,6 @@ from laneweave.sim_bridge.road.vehicles_in_part import (
 
 AHEAD_M = 1.0
 """How far a closed part reaches beyond the front of a vehicle that has broken down."""
-NOBODY = Name("")
 SPARE_M = 5.0
 """Room for vehicles that do not stop as close to each other as they could."""
 BEFORE_END_M = 0.1
@@ -86,7 +85,7 @@ class ActiveObstacle:
     breakdown: Breakdown | None = None
     event: RoadEvent | None = None
     """The cause of a part that is closed without a vehicle."""
-    vehicle: Name = NOBODY
+    vehicle: Name | None = None
     """The vehicle that has broken down or is passing, if any."""
     stands: bool = False
     """Whether it has stopped."""
@@ -248,12 +247,13 @@ class Obstacles:
         """Close the parts in which slow vehicles of other systems are now; end earlier ones."""
         current = {one.name: one.closed for one in self.passing.on_road if one.closed is not None}
         for one in self.active:
+            if one.kind != PASSING or one.vehicle is None or one.until_s < math.inf:
+                continue
             part = current.get(one.vehicle)
-            if one.kind == PASSING and one.until_s == math.inf:
-                if part is not None and part[:3] == one.part[:3]:
-                    del current[one.vehicle]
-                else:
-                    one.until_s = t_s
+            if part is not None and part[:3] == one.part[:3]:
+                del current[one.vehicle]
+            else:
+                one.until_s = t_s
         for name, part in current.items():
             with_room = self._with_room(part, vehicles)
             self.active.append(ActiveObstacle(PASSING, with_room, t_s, vehicle=name))
@@ -262,9 +262,9 @@ class Obstacles:
         self, one: ActiveObstacle, vehicles: Mapping[Name, RoadVehicle], t_s: float
     ) -> None:
         """Note that a vehicle that breaks down has stopped, or has left the road."""
-        vehicle = vehicles.get(one.vehicle)
-        if one.breakdown is None or one.stands:
+        if one.breakdown is None or one.vehicle is None or one.stands:
             return
+        vehicle = vehicles.get(one.vehicle)
         if vehicle is None:
             one.until_s = t_s
         elif vehicle.state[1] < STANDING_MPS:

@@ -29,7 +29,7 @@ from laneweave.sim_bridge.road.vehicles_in_part import (
     vehicles_in_part,
 )
 
-CLEARED_BEHIND_M = 10.0
+CLEARED_BEHIND_M = 20.0
 """Length of the lane behind a fast vehicle that none may enter."""
 AHEAD_M = 1.0
 """How far a closed part reaches beyond the front of a slow vehicle."""

@@ -62,7 +62,7 @@ def run_to_end(road: LonelyRoad, within_s: float = END_S) -> list[tuple[float, s
 
 
 def check_obstacle(one: ActiveObstacle, road: LonelyRoad) -> None:
-    broken = road.vehicles.get(one.vehicle)
+    broken = road.vehicles.get(one.vehicle or Name("none"))
     if one.kind == CLOSED and not one.is_over(road.t_s):
         assert one.part.lane not in {
             lane
@@ -125,6 +125,7 @@ def test_the_vehicle_slows_down_as_given_stands_as_long_as_given_and_is_where_it
         parts += [one for _, one in road.roadside.pop_obstacle_changes()]
         if not parts:
             continue
+        assert parts[0].vehicle is not None
         vehicle = road.vehicles[parts[0].vehicle]
         assert vehicle.state[2] >= -BREAKS_DOWN.decel_mps2 - 1e-6
         if math.isnan(stands_s) and vehicle.state[1] < STANDING_MPS:
@@ -181,7 +182,7 @@ def test_a_part_is_closed_for_an_event_and_used_again_afterwards() -> None:
 
     assert (closed, opened, part.cause) == (PART_CLOSED, PART_OPENED, CLOSED)
     assert (part.lane, part.from_m, part.to_m) == (LANE, 400.0, 450.0)
-    assert (part.vehicle, part.until_s) == ("", 60.0)
+    assert (part.vehicle, part.until_s) == (None, 60.0)
     assert closed_s >= 20.0
     assert opened_s >= 60.0
     assert len(names(road, LEFT_LATTICE)) >= 2

@@ -15,6 +15,7 @@ from laneweave.launch.fault_search.checks.checker import Checker
 from laneweave.launch.fault_search.road.light_vehicle import LightVehicle, Visit
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell
+from laneweave.protocol.road_layout import LanePosition
 from laneweave.protocol.runtime.node import Arrived, Effect, Event, Refuse, Send, Started, Wakeup
 from laneweave.protocol.runtime.transport import LinkUp
 from laneweave.protocol.scenario.fields import Scenario
@@ -31,6 +32,9 @@ from laneweave.sim_bridge.simulated_road import SimulatedRoad
 
 RE_ENTRY_S = 8.0
 """Time in which a vehicle drives from standing into its cell."""
+
+TOUCH_M = 0.1
+"""How far a body may reach into a closed part."""
 
 
 class Reception(Enum):
@@ -90,7 +94,11 @@ class LightRoad:
         self.vehicles = self._road.vehicles
         self._scenario = scenario
         self._checker = checker
-        self._lane_ends = LaneEnds(scenario)
+        self._roadside = roadside
+        self._inside: dict[LanePosition, set[Name]] = {}
+        """Vehicles that were in each part when it was closed."""
+        self._re_entered_s: dict[Name, float] = {}
+        """Road time at which vehicles without cells got cells again."""
         self._visits = visits
         self._move_lasts_s = move_lasts_s
         self._reception = reception
@@ -180,6 +188,7 @@ class LightRoad:
         self._road.enter()
         yield from self._road.begin_tick(now_s)
         self._check_lanes(now_s)
+        self._check_parts(now_s)
         for vehicle in self.vehicles.values():
             self._report_stored(now_s, vehicle)
 
@@ -223,7 +232,7 @@ class LightRoad:
         self._checker.refused(self.began_s + t_s, vehicle, refusal.problem.value)
 
     def on_obstacle(self, t_s: float, kind: str, obstacle: Obstacle) -> None:
-        """Do nothing: stories have no closed parts."""
+        """Do nothing."""
 
     def on_lane_end(self, t_s: float, vehicle: Name, lane: int, kind: str) -> None:
         """Let a body stop before the end of its lane, and come back; see `LaneEndControl`."""
@@ -234,11 +243,11 @@ class LightRoad:
             body.go(cell, t_s, self._scenario.runtime.tick_s)
         elif kind == LEFT_LATTICE:
             self._checker.leave(now_s, vehicle)
-            end = self._lane_ends.ahead(lane, body.state[0])
-            body.stop_at(math.inf if end is None else end.line_m)
+            body.stop_at(self._stops_m(one, lane))
         elif kind == DRIVES_OUT:
             body.re_enter(cell, t_s, RE_ENTRY_S)
         elif kind == ENTERED_LATTICE:
+            self._re_entered_s[vehicle] = t_s
             self._checker.enter(now_s, vehicle, cell, one.block)
 
     def _begin_move(self, vehicle: LightVehicle, held: Cell, now_s: float, lasts_s: float) -> None:
@@ -256,6 +265,58 @@ class LightRoad:
         if vehicle.controller.off_lattice is None:
             self._checker.store(now_s, vehicle.name, vehicle.controller.record)
 
+    @property
+    def _lane_ends(self) -> LaneEnds:
+        """Ends of lanes now."""
+        return self._roadside.lane_ends
+
+    def _stops_m(self, vehicle: LightVehicle, lane: int) -> float:
+        """Return where a body stops that has no cell any more: light bodies stop at once."""
+        s_m = vehicle.body.state[0]
+        end = self._lane_ends.ahead(lane, s_m)
+        if vehicle.controller.broken_mps2 is not None:
+            return s_m
+        if end is None:
+            return math.inf
+        # Before a part that is closed suddenly, the line may have come too late.
+        return max(end.line_m, s_m) if end.sudden else end.line_m
+
+    def _check_parts(self, now_s: float) -> None:
+        """Report vehicles with cells in closed parts, or beside a vehicle of another system."""
+        obstacles = self._roadside.obstacles
+        on_lattice = [
+            vehicle for vehicle in self.vehicles.values() if vehicle.controller.off_lattice is None
+        ]
+        for one in obstacles.active:
+            if one.is_over(self.t_s):
+                continue  # those that have waited start there
+            lane, from_m, to_m, _ = one.part
+            # In the short slots of the fault search, a body that falls back a column moves
+            # backwards on the road.
+            to_m = max(to_m - self._scenario.lattice.pitch_m, from_m + TOUCH_M)
+            inside = {
+                vehicle.name
+                for vehicle in on_lattice
+                if lane in vehicle.lanes_used and _is_beside(vehicle, from_m, to_m)
+            }
+            # Those that were inside when the part was closed drive out of it. Vehicles without
+            # cells would brake for what they sense, unlike light bodies.
+            off_lattice = self.vehicles.keys() - {vehicle.name for vehicle in on_lattice}
+            known = self._inside.setdefault(one.begins_at, inside | off_lattice)
+            for name in sorted(inside - known):
+                if lane in self.vehicles[name].lanes_touched:
+                    text = f"in lane {lane}, which is closed from {from_m:g} to {to_m:g} m"
+                    self._checker.beyond_end(now_s, name, text)
+        for other in obstacles.passing.on_road:
+            for vehicle in on_lattice:
+                if self.t_s < self._re_entered_s.get(vehicle.name, -math.inf) + RE_ENTRY_S:
+                    continue  # it was slower than it said
+                if other.passage.lane in vehicle.lanes_touched and _is_beside(
+                    vehicle, other.rear_m, other.s_m
+                ):
+                    text = f"touches {other.name} at {other.s_m:.1f} m"
+                    self._checker.beyond_end(now_s, vehicle.name, text)
+
     def _check_lanes(self, now_s: float) -> None:
         """Report bodies behind the end of their lane, or partly behind an exit."""
         tick_m = 1.5 * self._scenario.lattice.speed_mps * self._scenario.runtime.tick_s
@@ -268,6 +329,12 @@ class LightRoad:
                     text = f"in lanes {touched} at {s_m:.1f} m, exit at {exit_lane.end_m:g} m"
                     self._checker.beyond_end(now_s, name, text)
             end = self._lane_ends.ahead(vehicle.body_lane, s_m)
-            if end is not None and s_m > end.end_m:
+            if end is not None and not end.sudden and s_m > end.end_m:
                 text = f"at {s_m:.1f} m, its lane ends at {end.end_m:g} m"
                 self._checker.beyond_end(now_s, name, text)
+
+
+def _is_beside(vehicle: LightVehicle, from_m: float, to_m: float) -> bool:
+    """Return whether a body is between two positions, or partly."""
+    s_m = vehicle.state[0]
+    return s_m > from_m and s_m - vehicle.size[0] < to_m

@@ -14,6 +14,7 @@ from laneweave.coordinator.planning.rolling.problem import (
     CellPath,
     OpenRoad,
     StreamPlan,
+    StreamRoad,
     StreamVehicle,
 )
 from laneweave.coordinator.rolling.checked_planner import stream_road
@@ -112,7 +113,8 @@ class LightPlanner:
         now: OpenRoad | None = None,
     ) -> StreamPlan:
         """Return the cells of all vehicles at the start and the end of the next slot."""
-        del before, now
+        del before
+        road = self._road.as_open(now)
         rng = random.Random(f"{self._seed}/{slot}")  # noqa: S311 (simulation, no secrets)
         taken = {vehicle.cell for vehicle in vehicles} | set(blocked)
         paths: dict[str, CellPath] = {vehicle.vehicle: (vehicle.cell,) for vehicle in vehicles}
@@ -121,37 +123,51 @@ class LightPlanner:
             arrived = not self._away(vehicle, vehicle.cell)
             if vehicle.held or (arrived and rng.random() > UNNEEDED_MOVES):
                 continue
-            target = self._target(slot, vehicle, taken, rng)
+            target = self._target(road, slot, vehicle, taken, rng)
             if target is not None:
                 paths[vehicle.vehicle] = (vehicle.cell, target)
                 taken |= footprint(vehicle.cell, target)
         return StreamPlan(slot, paths, ())
 
     def _target(
-        self, slot: int, vehicle: StreamVehicle, taken: set[Cell], rng: random.Random
+        self,
+        road: StreamRoad,
+        slot: int,
+        vehicle: StreamVehicle,
+        taken: set[Cell],
+        rng: random.Random,
     ) -> Cell | None:
         column, lane = vehicle.cell
         cells = [(column + along, lane + across) for along, across in self._steps]
+        some_end = self._some_end or road is not self._road
         free = [
             cell
             for cell in cells
             if 0 <= cell[1] < self._lanes
             and vehicle.drives(cell[0] - column, cell[1] - lane)
-            and all(self._is_open(slot, vehicle.cell, cell, each) for each in (lane, cell[1]))
-            and not (self._some_end and self._road.has_left(slot + 1, cell))
+            and self._is_open(road, slot, vehicle, cell)
+            and not (some_end and road.has_left(slot + 1, cell))
             and taken.isdisjoint(footprint(vehicle.cell, cell) - {vehicle.cell})
         ]
         if not free:
             return None
         return min(free, key=lambda cell: (self._away(vehicle, cell), rng.random()))
 
-    def _is_open(self, slot: int, origin: Cell, target: Cell, lane: int) -> bool:
-        """Return whether a move stays where moves are possible in a lane, if it is an edge."""
-        if lane not in self._edges:
+    def _is_open(self, road: StreamRoad, slot: int, vehicle: StreamVehicle, target: Cell) -> bool:
+        """Return whether a move stays where moves are possible in its lanes.
+
+        Without closed or cleared parts, this is certain but for lanes at the edges.
+        """
+        (column, lane), now = vehicle.cell, road is not self._road
+        lanes = [each for each in {lane, target[1]} if now or each in self._edges]
+        if not lanes:
             return True
-        road = self._road
-        rear_m = road.position_m(slot, min(origin[0], target[0])) - road.body_m
-        return road.is_open(lane, rear_m, road.position_m(slot + 1, max(origin[0], target[0])))
+        rear_m = road.position_m(slot, min(column, target[0])) - road.body_m
+        front_m = road.position_m(slot + 1, max(column, target[0]))
+        change = lane, target[1]
+        return all(road.is_open(each, rear_m, front_m) for each in lanes) and not (
+            now and road.forbids(vehicle.vehicle_type, change, slot, rear_m, front_m)
+        )
 
     def _away(self, vehicle: StreamVehicle, cell: Cell) -> int:
         """Return the number of lanes from a cell to the nearest target."""
