@@ -1,9 +1,9 @@
 """Vehicles of other systems: each drives in one lane at a speed of its own.
 
-A slow one is a part of a lane that is closed, which jumps ahead once in a slot: vehicles leave its
-lane, or stop at the stop line of the part as it was then, and start again when the vehicle is far
-ahead. Before a fast one, the lane is cleared: vehicles leave it, and none enters it. Each brakes
-for what is ahead of it.
+Around a slow one, a part of its lane is closed, which jumps ahead once in a slot: vehicles leave
+the lane, or stop at the stop line of the part as it was then, and start again when the vehicle is
+far ahead. Before a fast one, the lane is cleared: vehicles leave it, and none enters it. Each
+brakes for what is ahead of it.
 """
 
 from __future__ import annotations
@@ -31,6 +31,9 @@ from laneweave.sim_bridge.road.vehicles_in_part import (
 
 CLEARED_BEHIND_M = 20.0
 """Length of the lane behind a fast vehicle that none may enter."""
+WAITING = 0.95
+"""Share of the speed of the lattice below which a fast vehicle is as slow as others, since it waits
+behind them."""
 AHEAD_M = 1.0
 """How far a closed part reaches beyond the front of a slow vehicle."""
 MIN_GAP_M = 2.0
@@ -173,8 +176,11 @@ class PassingVehicles:
                 self._changes.append((PART_CLOSED, entered.recorded))
         slot = math.floor(t_s / self._scenario.timing.cycles_s[0] + 1e-9)
         for one in self.on_road:
-            if self.is_fast(one.passage):
+            fast = self.is_fast(one.passage)
+            if fast:
                 one.cleared = self._cleared_for(one, t_s)
+            if fast and one.speed_mps >= WAITING * self._scenario.lattice.speed_mps:
+                one.closed = None
             elif one.closed is None or slot != self._slot:
                 one.closed = self._closed_around(one)
         self._slot = slot
@@ -266,7 +272,8 @@ class PassingVehicles:
 
     def _closed_around(self, one: PassingVehicle) -> TemporaryClosure:
         """Return the part of a lane in which a slow vehicle is up to the end of the next slot."""
-        ahead_m = 2.0 * self._scenario.timing.cycles_s[0] * one.passage.speed_mps + AHEAD_M
+        speed_mps = min(one.passage.speed_mps, self._scenario.lattice.speed_mps)
+        ahead_m = 2.0 * self._scenario.timing.cycles_s[0] * speed_mps + AHEAD_M
         return TemporaryClosure(one.passage.lane, one.rear_m, one.s_m + ahead_m)
 
     def pop_changes(self) -> list[tuple[str, Obstacle]]:

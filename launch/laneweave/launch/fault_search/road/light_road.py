@@ -20,6 +20,7 @@ from laneweave.protocol.runtime.node import Arrived, Effect, Event, Refuse, Send
 from laneweave.protocol.runtime.transport import LinkUp
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.lane_ends import LaneEnds
+from laneweave.protocol.vehicle.sudden_stops import stopping_m
 from laneweave.protocol.wire.events import DRIVES_OUT, ENTERED_LATTICE, LEFT_LATTICE, MISSED_EXIT
 from laneweave.protocol.wire.messages import ClosedFormation, Command, Name, Plan, Prepare, Sense
 from laneweave.protocol.wire.obstacle_messages import Obstacle
@@ -97,8 +98,6 @@ class LightRoad:
         self._roadside = roadside
         self._inside: dict[LanePosition, set[Name]] = {}
         """Vehicles that were in each part when it was closed."""
-        self._re_entered_s: dict[Name, float] = {}
-        """Road time at which vehicles without cells got cells again."""
         self._visits = visits
         self._move_lasts_s = move_lasts_s
         self._reception = reception
@@ -247,7 +246,6 @@ class LightRoad:
         elif kind == DRIVES_OUT:
             body.re_enter(cell, t_s, RE_ENTRY_S)
         elif kind == ENTERED_LATTICE:
-            self._re_entered_s[vehicle] = t_s
             self._checker.enter(now_s, vehicle, cell, one.block)
 
     def _begin_move(self, vehicle: LightVehicle, held: Cell, now_s: float, lasts_s: float) -> None:
@@ -299,23 +297,35 @@ class LightRoad:
                 for vehicle in on_lattice
                 if lane in vehicle.lanes_used and _is_beside(vehicle, from_m, to_m)
             }
-            # Those that were inside when the part was closed drive out of it. Vehicles without
-            # cells would brake for what they sense, unlike light bodies.
-            off_lattice = self.vehicles.keys() - {vehicle.name for vehicle in on_lattice}
-            known = self._inside.setdefault(one.begins_at, inside | off_lattice)
+            # Those that were inside when the part was closed drive out of it.
+            known = self._inside.setdefault(
+                one.begins_at, inside | self._without_room(one.part.from_m)
+            )
             for name in sorted(inside - known):
                 if lane in self.vehicles[name].lanes_touched:
                     text = f"in lane {lane}, which is closed from {from_m:g} to {to_m:g} m"
                     self._checker.beyond_end(now_s, name, text)
         for other in obstacles.passing.on_road:
-            for vehicle in on_lattice:
-                if self.t_s < self._re_entered_s.get(vehicle.name, -math.inf) + RE_ENTRY_S:
-                    continue  # it was slower than it said
-                if other.passage.lane in vehicle.lanes_touched and _is_beside(
-                    vehicle, other.rear_m, other.s_m
-                ):
-                    text = f"touches {other.name} at {other.s_m:.1f} m"
+            lane, lattice_mps = other.passage.lane, self._scenario.lattice.speed_mps
+            for vehicle in on_lattice if other.speed_mps >= lattice_mps else ():
+                # Light bodies do not brake for it: only lane changes must not lead there.
+                changed = vehicle.controller.motion.origin[1] != vehicle.cell[1] == lane
+                beside = _is_beside(vehicle, other.rear_m, other.s_m)
+                if changed and beside and lane in vehicle.lanes_touched:
+                    text = f"changes lanes beside {other.name}, at {other.s_m:.1f} m"
                     self._checker.beyond_end(now_s, vehicle.name, text)
+
+    def _without_room(self, from_m: float) -> set[Name]:
+        """Return the vehicles that would brake for what they sense, unlike light bodies.
+
+        They have no cells, or could not stop before a part that begins there.
+        """
+        return {
+            vehicle.name
+            for vehicle in self.vehicles.values()
+            if vehicle.controller.off_lattice is not None
+            or from_m - 2.0 * stopping_m(self._scenario.lattice.speed_mps) < vehicle.state[0]
+        }
 
     def _check_lanes(self, now_s: float) -> None:
         """Report bodies behind the end of their lane, or partly behind an exit."""
