@@ -60,7 +60,7 @@ from laneweave.protocol.state_machine import Function, RuleBook
 from laneweave.protocol.summary import described
 from laneweave.protocol.vehicle.execution_rules import VEHICLE_RULES
 from laneweave.protocol.vehicle.plan_execution import ExecutionPhase
-from laneweave.protocol.wire import events, messages, process_messages
+from laneweave.protocol.wire import events, messages, obstacle_messages, process_messages
 from laneweave.protocol.wire.common_settings import GROUPS, groups_of
 from laneweave.protocol.wire.identities import Identity
 from laneweave.protocol.wire.topics import TOPICS, Exchange, Party, Topic
@@ -132,6 +132,7 @@ _PARTIES = (
     Party.VEHICLE,
     Party.FLEET,
     Party.CLIENT,
+    Party.OPERATOR,
     Party.OBSERVER,
 )
 
@@ -227,7 +228,8 @@ def _topics() -> str:
 def _messages() -> str:
     """Return a section for each message class: its docstring and a table of its fields."""
     sections = []
-    for node in (*_syntax(messages).body, *_syntax(process_messages).body):
+    modules = messages, obstacle_messages, process_messages
+    for node in (node for module in modules for node in _syntax(module).body):
         if isinstance(node, ast.ClassDef):
             lines = [f"### {node.name}\n\n{ast.get_docstring(node)}\n"]
             lines += ["| Field | Meaning |", "|---|---|"]

@@ -13,9 +13,9 @@ from laneweave.agents.core import AgentCore
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.road_layout import Exits, TemporaryClosure
 from laneweave.protocol.scenario.vehicle_types import VehicleTypes
-from laneweave.protocol.vehicle.lane_ends import LaneEnd, LaneEnds
+from laneweave.protocol.vehicle.lane_end import LaneEnd, ReEntry
+from laneweave.protocol.vehicle.lane_ends import LaneEnds
 from laneweave.protocol.vehicle.plan_execution import PlanExecution
-from laneweave.protocol.vehicle.re_entry import ReEntry
 from laneweave.protocol.wire.messages import Census, CensusEntry, Command, Name, Sense
 from laneweave.sim_bridge.bodies import motion_controller
 from laneweave.sim_bridge.bodies.motion_controller import MotionController, OffLatticePhase

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from laneweave.agents.driving.tracking_problem import Gaps
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.vehicle_tables import Vehicle
-from laneweave.protocol.vehicle.lane_ends import LaneEnd, LaneEnds
+from laneweave.protocol.vehicle.lane_end import LaneEnd
+from laneweave.protocol.vehicle.lane_ends import LaneEnds
 from laneweave.protocol.vehicle.motion import State
 
 Array = NDArray[np.float64]

@@ -20,16 +20,16 @@ from laneweave.protocol.scenario.road_tables import (
     SolidLine,
     TypeShare,
 )
+from laneweave.protocol.vehicle.lane_end import LaneEnd
 from laneweave.protocol.vehicle.lane_ends import (
-    LaneEnd,
     LaneEnds,
     dead_ends,
     early_start_m,
     exit_lanes,
     first_step_m,
     lane_beside,
+    re_entry,
 )
-from laneweave.protocol.vehicle.re_entry import re_entry
 from laneweave.protocol.vehicle.sudden_stops import begins_m, room_before_part_m
 from laneweave.protocol.wire.messages import CAR
 

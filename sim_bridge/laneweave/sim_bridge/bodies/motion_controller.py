@@ -284,9 +284,8 @@ class MotionController:
         emergency, beside another body, before one that could not brake for it, or too late for an
         exit. A newer incarnation takes charge. Its first command must keep the hold cell: no plan
         can allow a process to move the vehicle before it is in charge. A rejected process may try
-        again at the next tick.
-
-        A command without jerks and with the current hold cell does not change the motion.
+        again at the next tick. One without jerks and with the current hold cell does not change the
+        motion.
 
         Returns:
             Whether the command was accepted.
@@ -313,8 +312,8 @@ class MotionController:
         self.command_tick = command.tick
         self.store_requests(command)
         t_s = command.tick * self.tick_s
-        known = command.motion.origin in (self.hold_cell, self.motion.origin)
-        if not (leaves or known or self.off_lattice):  # a late command
+        known = leaves or command.motion.origin in (self.hold_cell, self.motion.origin)
+        if self.off_lattice is None and not known:
             self.refusal = Refusal(Problem.MOVE)
             return False
         if leaves:

@@ -7,7 +7,8 @@ from attrs import Factory, define
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.vehicle_tables import Vehicle
-from laneweave.protocol.vehicle.lane_ends import NEAR_LINE_M, LaneEnd, LaneEnds
+from laneweave.protocol.vehicle.lane_end import LaneEnd
+from laneweave.protocol.vehicle.lane_ends import NEAR_LINE_M, LaneEnds
 from laneweave.protocol.vehicle.motion import State
 from laneweave.protocol.wire.messages import Command, Neighbour
 

@@ -20,8 +20,15 @@ from attrs import define, frozen
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.road_layout import LanePosition, TemporaryClosure
 from laneweave.protocol.scenario.fields import Scenario
-from laneweave.protocol.vehicle.lane_ends import NEAR_LINE_M, LaneEnd, LaneEnds, lane_beside
-from laneweave.protocol.vehicle.re_entry import START_S, own_re_entry, re_entry
+from laneweave.protocol.vehicle.lane_end import LaneEnd
+from laneweave.protocol.vehicle.lane_ends import (
+    NEAR_LINE_M,
+    START_S,
+    LaneEnds,
+    lane_beside,
+    own_re_entry,
+    re_entry,
+)
 from laneweave.protocol.vehicle.sudden_stops import queue_pitch_m
 from laneweave.protocol.vehicle.territory import territory_of
 from laneweave.protocol.wire.events import DRIVES_OUT, ENTERED_LATTICE, LEFT_LATTICE, MISSED_EXIT

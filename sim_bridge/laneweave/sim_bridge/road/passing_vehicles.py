@@ -23,8 +23,8 @@ from laneweave.protocol.wire.events import PART_CLOSED, PART_OPENED
 from laneweave.protocol.wire.messages import Name
 from laneweave.protocol.wire.obstacle_messages import PASSING, Cleared, Obstacle
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import Size
-from laneweave.sim_bridge.road.vehicle import RoadVehicle
 from laneweave.sim_bridge.road.vehicles_in_part import (
+    BodyOnRoad,
     cleared_before_m,
     vehicles_in_part,
 )
@@ -155,7 +155,7 @@ class PassingVehicles:
         """Return whether a vehicle comes from behind: it is at least as fast as the lattice."""
         return passage.speed_mps >= self._scenario.lattice.speed_mps
 
-    def update(self, vehicles: Mapping[Name, RoadVehicle], t_s: float) -> None:
+    def update(self, vehicles: Mapping[Name, BodyOnRoad], t_s: float) -> None:
         """Let vehicles enter and leave, and update what is closed and cleared for them."""
         end_m = self._scenario.road.length_m
         for one in list(self.on_road):
@@ -185,7 +185,7 @@ class PassingVehicles:
                 one.closed = self._closed_around(one)
         self._slot = slot
 
-    def step(self, vehicles: Iterable[RoadVehicle], tick_s: float) -> None:
+    def step(self, vehicles: Iterable[BodyOnRoad], tick_s: float) -> None:
         """Move all vehicles by a tick."""
         if not self.on_road:
             return
@@ -204,7 +204,7 @@ class PassingVehicles:
             one.step(*min(ahead, default=(math.inf, 0.0)), tick_s)
 
     def _has_room(
-        self, passage: RoadEvent, vehicles: Mapping[Name, RoadVehicle], t_s: float
+        self, passage: RoadEvent, vehicles: Mapping[Name, BodyOnRoad], t_s: float
     ) -> bool:
         """Return whether a vehicle can enter: nobody has to brake hard for it, nor it for others.
 

@@ -106,6 +106,11 @@ class RoadVehicle:
         return {*self.lanes_touched, self.cell[1]}
 
     @property
+    def has_cell(self) -> bool:
+        """Whether it is on the lattice."""
+        return self.controller.off_lattice is None
+
+    @property
     def keeps_lane(self) -> bool:
         """Whether the body is in its lane, and no plan in force leads it out of its cell."""
         return self.controller.keeps_lane

@@ -3,14 +3,37 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import Protocol
 
 from attrs import frozen
 
 from laneweave.protocol.scenario.fields import Scenario
-from laneweave.protocol.vehicle.re_entry import re_entry
+from laneweave.protocol.vehicle.lane_ends import re_entry
+from laneweave.protocol.vehicle.motion import State
 from laneweave.protocol.vehicle.sudden_stops import room_before_part_m, stops_before
 from laneweave.protocol.wire.messages import Name
-from laneweave.sim_bridge.road.vehicle import RoadVehicle
+
+
+class BodyOnRoad(Protocol):
+    """What matters of a vehicle on the road to closed parts; see `RoadVehicle`."""
+
+    name: Name
+
+    @property
+    def state(self) -> State:
+        """(s [m], v [m/s], a [m/s2], y [m], v_y [m/s], a_y [m/s2])."""
+
+    @property
+    def size(self) -> tuple[float, float]:
+        """Length and width of the body [m]."""
+
+    @property
+    def lanes_used(self) -> set[int]:
+        """Lanes in which parts of the body are, or will be."""
+
+    @property
+    def has_cell(self) -> bool:
+        """Whether it is on the lattice."""
 
 
 @frozen
@@ -55,7 +78,7 @@ def cleared_before_m(scenario: Scenario) -> float:
 
 
 def vehicles_in_part(
-    scenario: Scenario, lane: int, from_m: float, to_m: float, vehicles: Iterable[RoadVehicle]
+    scenario: Scenario, lane: int, from_m: float, to_m: float, vehicles: Iterable[BodyOnRoad]
 ) -> VehiclesInPart:
     """Return the vehicles in the way of a part that is to be closed from and to a position."""
     inside, near, coming = list[Name](), list[Name](), list[Name]()
@@ -66,7 +89,7 @@ def vehicles_in_part(
             continue
         if s_m >= from_m:
             inside.append(vehicle.name)
-        elif vehicle.controller.off_lattice is not None and from_m - s_m < room_m:
+        elif not vehicle.has_cell and from_m - s_m < room_m:
             near.append(vehicle.name)  # it would start into the part
         elif stops_before(from_m, s_m, speed_mps):
             coming.append(vehicle.name)

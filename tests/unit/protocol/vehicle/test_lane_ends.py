@@ -24,16 +24,16 @@ from laneweave.protocol.road_layout import (
 )
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.road_tables import Closure, Exit
+from laneweave.protocol.vehicle.lane_end import LaneEnd
 from laneweave.protocol.vehicle.lane_ends import (
-    LaneEnd,
     LaneEnds,
     dead_ends,
     early_start_m,
     lane_beside,
+    re_entry,
     sections_to_lines,
 )
 from laneweave.protocol.vehicle.motion import cell_state
-from laneweave.protocol.vehicle.re_entry import re_entry
 from laneweave.protocol.wire.messages import CurrentMotion, Neighbour
 from laneweave.sim_bridge.bodies.motion_controller import FallbackLevel, MotionController
 from support.closed_lanes import BLOCKED, DROP

@@ -10,8 +10,7 @@ from attrs import evolve
 
 from laneweave.protocol.road_layout import TemporaryClosure, TemporaryParts
 from laneweave.protocol.scenario.road_tables import Closure, Demand, RoadEvent
-from laneweave.protocol.vehicle.lane_ends import LaneEnds
-from laneweave.protocol.vehicle.re_entry import re_entry
+from laneweave.protocol.vehicle.lane_ends import LaneEnds, re_entry
 from laneweave.protocol.vehicle.sudden_stops import room_before_part_m
 from laneweave.protocol.wire.events import (
     DRIVES_OUT,

@@ -16,27 +16,30 @@ from attrs import evolve
 from numpy.typing import NDArray
 
 from laneweave.coordinator.planning.conflict_kinds import ConflictModel, conflict_offsets
-from laneweave.coordinator.planning.rolling.lane_rules import (
-    Bools,
-    Floats,
-    Ints,
-    LaneRules,
-    Singles,
-    Zones,
-    lane_rules,
-    zones,
-)
 from laneweave.coordinator.planning.rolling.paths_kernel import (
     ENTERING,
     FIXED,
     MAX_EJECTED,
     PENALTY,
+    UNREACHED,
 )
 from laneweave.coordinator.planning.rolling.problem import (
     ROUNDING_M,
     StreamCosts,
     StreamRoad,
     StreamVehicle,
+)
+from laneweave.coordinator.planning.rolling.window_arrays import (
+    Bools,
+    Costs,
+    Floats,
+    Ints,
+    Paths,
+    Saved,
+    Scratch,
+    Singles,
+    Table,
+    Window,
 )
 from laneweave.protocol.lattice import Cell, Mode, displacements
 
@@ -46,129 +49,32 @@ _SAVED = MAX_EJECTED + 32
 """Maximum number of paths saved during a chain or a reordering."""
 
 
-class Table(NamedTuple):
-    """The moves of all vehicles, and the penalties of conflicting moves."""
+class _LaneRules(NamedTuple):
+    """Where vehicles may not drive or change lanes because of their type.
 
-    load: Singles
-    """Sum of the penalties of all vehicles whose moves conflict with this move, plus a multiple of
-    `FIXED` if it is forbidden; (slots, displacements, lanes, columns)."""
-    vehicle: NDArray[np.int32]
-    """Vehicle in each cell at the beginning of each slot, -1: none; (slots, lanes, columns)."""
-    move: NDArray[np.int8]
-    """Displacement of that vehicle in the slot; same shape."""
-    offsets: Ints
-    """Relative column and lane, displacement and penalty factor of each conflicting move;
-    (conflicts, 4)."""
-    first: Ints
-    """Index in `offsets` of the first conflict of each displacement; (displacements + 1)."""
-    steps: Ints
-    """Column and lane of each displacement; (displacements, 2)."""
-    moving_columns: Ints
-    """First and last column in which moves may start in each slot; (slots, 2)."""
-    forbidden: Singles
-    """`UNREACHED` for each move that the types of a group may not make, otherwise 0;
-    (groups - 1, slots, displacements, lanes, columns). Group 0 may make all moves."""
-    zone: NDArray[np.int16]
-    """Zone in which each cell is at the beginning of each slot; (slots + 1, lanes, columns). A zone
-    is a section, with what is beyond its end, or a part of one that some groups should leave; -1:
-    no section, if there are no such parts."""
-    left: Bools
-    """Whether each cell is beyond the end of its section; same shape."""
-    first_left: Ints
-    """First column of each lane beyond the end of a section; (slots + 1, lanes)."""
-    road_end: Ints
-    """First column from which all cells are beyond the ends of their sections; (slots + 1)."""
-    mixed: Bools
-    """Whether the cells of each lane are in different zones; (lanes)."""
+    Types to which restrictions or solid lines apply form *groups*. Lane changes that are forbidden
+    are never planned. Driving on in a lane that is restricted ahead is not forbidden, since a
+    vehicle that has no room beside it must drive on; it only has a high cost.
+    """
 
-
-class Paths(NamedTuple):
-    """The vehicles, sorted by column, and their paths; the first index is the vehicle."""
-
-    column: Ints
-    """Column at the beginning of each slot; (vehicles, slots + 1)."""
-    lane: Ints
-    move: NDArray[np.int8]
-    """Displacements; (vehicles, slots)."""
-    slots: Ints
-    """Number of slots in the path up to the end of its last section."""
-    target: Bools
-    """Whether each zone is in a target, and False for no section; (vehicles, zones)."""
-    zone_cost: Singles
-    """Cost of each slot that begins in a zone; same shape."""
     group: Ints
-    """Index of the group of types to which the vehicle belongs."""
-    held: Bools
-    waits: Ints
-    """Number of slots in which the vehicle stays first."""
-    drives: Bools
-    """Whether the vehicle can drive each displacement; (vehicles, displacements)."""
-    missing_cost: Floats
-    """Cost of ending elsewhere than at a target."""
-    min_cost: Floats
-    """Lower bound on the cost of paths that end at a target."""
-    can_arrive: Bools
-    """Whether there are enough slots to reach a target, ignoring other vehicles."""
-    urgent_cost: Floats
-    """Cost from which ejection chains make room for a vehicle that can arrive."""
-    penalty: Ints
-    """Cost to other vehicles of a conflict with this one."""
-    cost: Floats
-    placed: Bools
-    """Whether the path is in the table."""
+    """Group of each vehicle; 0: no rules apply to it."""
+    forbidden: Singles
+    """`Table.forbidden`."""
+    restricted: Bools
+    """Whether a vehicle that stays in a lane drives where it may not, in the slot that begins in a
+    cell; (groups - 1, slots + 1, lanes, columns)."""
 
 
-class Costs(NamedTuple):
-    """`StreamCosts` for the compiled code."""
+class _Zones(NamedTuple):
+    """Sections, divided where restrictions of groups begin and end."""
 
-    of_move: Singles
-    """Cost of each displacement."""
-    restricted: np.float32
-
-
-class Saved(NamedTuple):
-    """Paths as they were before a change that may be undone."""
-
-    vehicle: Ints
-    slots: Ints
-    cost: Floats
-    move: NDArray[np.int8]
-    column: Ints
-    lane: Ints
-
-
-class Scratch(NamedTuple):
-    """Working memory of the search, allocated once."""
-
-    saved: Saved
-    marked: Bools
-    """Whether each vehicle's path is saved."""
-    value: Singles
-    """Minimum cost of reaching a cell; (slots + 1, lanes, columns around the start, and one unused
-    column on either side)."""
-    delay: Singles
-    """Extra cost of a move in each slot."""
-    row: Singles
-    """Minimum costs of a lane in a slot, including those of cells outside target sections."""
-    searches: Ints
-    """(1,) number of path searches."""
-    queue: Ints
-    hit: Ints
-    chosen: Ints
-    off_lane: Ints
-    costly: Ints
-    """These work lists have room for all vehicles."""
-
-
-class Window(NamedTuple):
-    """All arrays for planning one slot."""
-
-    low: int
-    """Lattice column of the window's lowest column."""
-    table: Table
-    paths: Paths
-    costs: Costs
-    scratch: Scratch
+    of_cell: NDArray[np.int16]
+    """`Table.zone`."""
+    section: Ints
+    """Section of each zone; -1: none."""
+    restricted: Bools
+    """Whether each zone is restricted for each group; (groups - 1, zones)."""
 
 
 def window(
@@ -191,7 +97,7 @@ def window(
     slots += int(np.ceil(reach * road.pitch_m / road.advance_m))
     at_m = now_m + np.arange(slots + 1)[:, None] * road.advance_m
     starts_m = _starts_m(road, at_m[:-1])
-    rules = lane_rules(road, vehicles, slot, at_m, starts_m)
+    rules = _lane_rules(road, vehicles, slot, at_m, starts_m)
     table, own_zones = _table(road, at_m, starts_m, low, blocked, rules)
     # A path must remain cheaper than one with a forbidden move.
     restricted = costs.cleared if road.cleared else costs.restricted
@@ -211,8 +117,8 @@ def _table(
     starts_m: Floats,
     low: int,
     blocked: Collection[Cell],
-    rules: LaneRules,
-) -> tuple[Table, Zones]:
+    rules: _LaneRules,
+) -> tuple[Table, _Zones]:
     """Return an empty table and its zones; `at_m`: positions of columns when slots begin."""
     slots, columns = at_m.shape[0] - 1, at_m.shape[1]
     offsets, first = _offsets(road.mode, road.model)
@@ -223,7 +129,7 @@ def _table(
     steps = displacements(road.mode)
     load = np.zeros((slots, len(steps), road.lanes, columns), dtype=np.float32)
     section, left, latest_m = _sections(road, at_m)
-    found = zones(section, rules.restricted, len(road.sections))
+    found = _zones(section, rules.restricted, len(road.sections))
     zone = found.of_cell
     may_move = _may_move(road, starts_m, latest_m, is_blocked)
     load[:, 1:][~may_move] = FIXED * ENTERING
@@ -248,6 +154,70 @@ def _table(
         (zone != zone[:1, :, :1]).any(axis=(0, 2)),
     )
     return table, found
+
+
+def _lane_rules(
+    road: StreamRoad,
+    vehicles: Sequence[StreamVehicle],
+    first_slot: int,
+    at_m: Floats,
+    starts_m: Floats,
+) -> _LaneRules:
+    """Return the rules for vehicles; `at_m`: positions of columns at the beginning of slots."""
+    types = [one.vehicle_type for one in vehicles]
+    names = [name for name in sorted(set(types)) if road.cleared or road.rules_of(name)]
+    numbers = {name: number for number, name in enumerate(names, start=1)}
+    slots, columns = at_m.shape[0] - 1, at_m.shape[1]
+    later = first_slot + np.arange(slots + 1.0)[:, None]
+    steps = displacements(road.mode)
+    shape = (len(names), slots, len(steps), road.lanes, columns)
+    rules = _LaneRules(
+        np.array([numbers.get(name, 0) for name in types], dtype=np.int64),
+        np.zeros(shape, dtype=np.float32),
+        np.zeros((len(names), slots + 1, road.lanes, columns), dtype=np.bool_),
+    )
+    if not names:
+        return rules
+    for name, forbidden, restricted in zip(names, rules.forbidden, rules.restricted, strict=True):
+        for (lane, to_lane), from_m, to_m in road.forbidden_changes(name, later[:-1]):
+            if not 0 <= min(lane, to_lane) <= max(lane, to_lane) < road.lanes:
+                continue
+            start_m = np.maximum(starts_m[:, lane], starts_m[:, to_lane])
+            for d, (column, side) in enumerate(steps):
+                if side == to_lane - lane:
+                    rear_m = start_m - road.body_m + min(0, column) * road.pitch_m
+                    front_m = start_m + road.advance_m + max(0, column) * road.pitch_m
+                    is_there = (rear_m < to_m - ROUNDING_M) & (front_m > from_m + ROUNDING_M)
+                    forbidden[:, d, lane][is_there] = UNREACHED
+        for lane, from_m, to_m in road.places_to_leave(name, later):
+            restricted[:, lane] |= (at_m - road.body_m < to_m - ROUNDING_M) & (
+                at_m + road.advance_m > from_m + ROUNDING_M
+            )
+    return rules
+
+
+def _zones(section: NDArray[np.int16], restricted: Bools, sections: int) -> _Zones:
+    """Divide sections where restrictions begin and end.
+
+    Args:
+        section: section of each cell at the beginning of each slot; -1: none.
+        restricted: `_LaneRules.restricted`.
+        sections: number of sections.
+    """
+    groups = len(restricted)
+    if not groups:
+        numbers = np.array([*range(sections), -1], dtype=np.int64)
+        return _Zones(section, numbers, np.zeros((0, sections + 1), dtype=np.bool_))
+    code = section.astype(np.int64) + 1
+    for own in restricted:
+        code = 2 * code + own
+    codes, of_cell = np.unique(code, return_inverse=True)
+    bits = [(codes >> (groups - 1 - group)) & 1 for group in range(groups)]
+    return _Zones(
+        of_cell.reshape(section.shape).astype(np.int16),
+        (codes >> groups) - 1,
+        np.array(bits, dtype=np.bool_),
+    )
 
 
 def _starts_m(road: StreamRoad, front_m: Floats) -> Floats:
@@ -326,8 +296,8 @@ def _paths(
     table: Table,
     low: int,
     vehicles: Sequence[StreamVehicle],
-    rules: LaneRules,
-    own_zones: Zones,
+    rules: _LaneRules,
+    own_zones: _Zones,
 ) -> Paths:
     slots, count = len(table.load), len(vehicles)
     column, lane = np.zeros((2, count, slots + 1), dtype=np.int64)

@@ -23,8 +23,7 @@ from itertools import chain
 import numpy as np
 
 from laneweave.coordinator.planning.rolling import search_kernel as kernel
-from laneweave.coordinator.planning.rolling.arrays import Window, window
-from laneweave.coordinator.planning.rolling.lane_rules import Ints
+from laneweave.coordinator.planning.rolling.arrays import window
 from laneweave.coordinator.planning.rolling.problem import (
     CellPath,
     OpenRoad,
@@ -33,6 +32,7 @@ from laneweave.coordinator.planning.rolling.problem import (
     StreamRoad,
     StreamVehicle,
 )
+from laneweave.coordinator.planning.rolling.window_arrays import Ints, Window
 from laneweave.protocol.lattice import Cell
 
 
