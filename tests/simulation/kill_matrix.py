@@ -68,6 +68,7 @@ MARKED = (
     *("tests/scenarios/test_planted_bugs.py", "tests/simulation"),
     "tests/unit/sim_bridge/road/test_lane_end_control.py",
     "tests/unit/sim_bridge/road/test_obstacles.py",
+    "tests/unit/sim_bridge/road/test_passing_vehicles.py",
 )
 """Where tests with the marker are."""
 JOBS = 2

@@ -14,6 +14,7 @@ from support.bugs import Bug, catches
 
 LANE_ENDS, ROADS, FORMATIONS = "lane-ends", "roads", "entry-roads"
 INTERCHANGES = "interchanges"
+SURPRISES, WITH_FORMATIONS = "surprises", "entry-surprises"
 NOTICED: list[tuple[str, Bug, int]] = [
     (ROADS, road_bugs.ramps_are_issued_at_the_start, 0),
     (ROADS, road_bugs.cells_are_passed_on_twice, 0),
@@ -35,6 +36,10 @@ NOTICED: list[tuple[str, Bug, int]] = [
     (FORMATIONS, road_bugs.columns_are_not_reserved, 17),
     (FORMATIONS, road_bugs.exits_are_closed, 8),
     (FORMATIONS, road_bugs.types_are_ignored, 11),
+    (SURPRISES, road_bugs.controllers_do_not_know, 1),
+    (SURPRISES, road_bugs.parts_open_while_vehicles_wait, 0),
+    (SURPRISES, road_bugs.closed_parts_do_not_move, 129),
+    (WITH_FORMATIONS, road_bugs.controllers_do_not_know, 1),
 ]
 """Profiles, bugs, and a seed that catches each."""
 
@@ -69,7 +74,10 @@ def test_an_agent_gives_up_a_move_that_its_lane_end_does_not_allow_any_more(
     ("profile", "seed"),
     [
         (profile, n)
-        for profile, count in ((ROADS, 20), (INTERCHANGES, 10), (FORMATIONS, 6))
+        for profile, count in (
+            *((ROADS, 20), (INTERCHANGES, 10), (FORMATIONS, 6)),
+            *((SURPRISES, 20), (WITH_FORMATIONS, 10)),
+        )
         for n in range(count)
     ],
 )
@@ -87,6 +95,8 @@ def test_runs_without_violations(profile: str, seed: int) -> None:
             (ROADS, 200),
             (INTERCHANGES, 200),
             (FORMATIONS, 200),
+            (SURPRISES, 1500),
+            (WITH_FORMATIONS, 1500),
         )
         for seed in range(1000, 1000 + count)
     ],

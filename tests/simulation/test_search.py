@@ -27,6 +27,7 @@ BATCH = 5
 SEEDS = 20
 LONG = {
     *("roads", "interchanges", "entry-roads", "lane-ends", "dense", "clocks"),
+    *("surprises", "entry-surprises"),
     *("rolling", "rolling-dense", "entry-rolling", "harmful-rolling"),
 }
 """Profiles whose search takes more than ten seconds."""

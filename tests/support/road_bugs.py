@@ -266,6 +266,12 @@ def controllers_do_not_know(*_: object) -> None:
     """Motion controllers do not learn which parts are closed."""
 
 
+@breaks(OBSTACLES, LaneEnds, "enters_cleared")
+def cleared_parts_are_entered(*_: object) -> bool:
+    """Vehicles change lanes into a part that is cleared."""
+    return False
+
+
 # --- vehicles of other systems ------------------------------------------------------------------
 
 

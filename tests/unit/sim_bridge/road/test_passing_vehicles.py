@@ -10,8 +10,9 @@ from attrs import evolve
 
 from laneweave.protocol.scenario.road_tables import Demand, RoadEvent
 from laneweave.protocol.wire.events import PART_CLOSED, PART_OPENED
-from laneweave.protocol.wire.messages import Name
+from laneweave.protocol.wire.messages import Command, CurrentMotion, Name, VehicleRecord
 from laneweave.protocol.wire.obstacle_messages import PASSING, Obstacle
+from laneweave.sim_bridge.bodies.stop_lines import StopLinesAhead
 from laneweave.sim_bridge.road.passing_vehicles import (
     CLEARED_BEHIND_M,
     PassingVehicle,
@@ -156,7 +157,30 @@ def test_the_gap_from_which_a_vehicle_does_not_brake() -> None:
         assert (vehicle.speed_mps < 25.0) is brakes
 
 
+def test_motion_controllers_begin_no_lane_change_in_front_of_a_fast_vehicle() -> None:
+    road = lonely_road(FAST)
+    while not road.roadside.obstacles.passing.on_road:
+        road.step()
+    (other,) = road.roadside.obstacles.passing.on_road
+    road.step()
+    lines = StopLinesAhead(road.scenario, road.scenario.vehicle, road.roadside.lane_ends)
+    lattice, tick = road.scenario.lattice, road.tick
+    slot_ticks = round(road.scenario.timing.cycles_s[0] / TICK_S)
+    for ahead_m, allowed in ((20.0, False), (gap_needed_m(25.0, 15.0), False), (400.0, True)):
+        column = math.ceil((other.s_m + ahead_m - lattice.cell_s_m(0, road.t_s)) / lattice.pitch_m)
+        command = Command(
+            vehicle=Name("v0001"),
+            record=VehicleRecord(),
+            tick=tick,
+            hold_cell=(column, 1),
+            motion=CurrentMotion((column, 0), tick + slot_ticks),
+            jerks=b"",
+        )
+        assert lines.allow(command, road.t_s) is allowed
+
+
 BUGS: tuple[Bug, ...] = (
+    road_bugs.cleared_parts_are_entered,
     road_bugs.closed_parts_do_not_move, road_bugs.others_brake_for_nobody,
     road_bugs.others_enter_without_room, road_bugs.cleared_lanes_are_entered,
 )  # fmt: skip
@@ -166,6 +190,7 @@ def check_all() -> None:
     run_to_end(lonely_road(evolve(SLOW, for_s=60.0)))
     run_to_end(lonely_road(FAST))
     test_no_vehicle_enters_a_lane_that_is_cleared()
+    test_motion_controllers_begin_no_lane_change_in_front_of_a_fast_vehicle()
 
 
 @pytest.mark.parametrize(

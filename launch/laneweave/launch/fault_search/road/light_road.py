@@ -28,6 +28,7 @@ from laneweave.sim_bridge.bodies.command_checks import Refusal
 from laneweave.sim_bridge.recording.run_record import RecordedVehicle
 from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.road.entry import Admission
+from laneweave.sim_bridge.road.passing_vehicles import PREDICTED_M, gap_needed_m
 from laneweave.sim_bridge.road.roadside import Roadside
 from laneweave.sim_bridge.simulated_road import SimulatedRoad
 
@@ -256,6 +257,8 @@ class LightRoad:
         along, across = cell[0] - held[0], cell[1] - held[1]
         if (along, across) not in self._scenario.types[vehicle.arrival.vehicle_type].moves:
             self._checker.undrivable(now_s, name, move)
+        if across:
+            self._check_change(vehicle, held, now_s)
         vehicle.body.go(cell, now_s - self.began_s, lasts_s)
 
     def _report_stored(self, now_s: float, vehicle: LightVehicle) -> None:
@@ -305,15 +308,22 @@ class LightRoad:
                 if lane in self.vehicles[name].lanes_touched:
                     text = f"in lane {lane}, which is closed from {from_m:g} to {to_m:g} m"
                     self._checker.beyond_end(now_s, name, text)
-        for other in obstacles.passing.on_road:
-            lane, lattice_mps = other.passage.lane, self._scenario.lattice.speed_mps
-            for vehicle in on_lattice if other.speed_mps >= lattice_mps else ():
-                # Light bodies do not brake for it: only lane changes must not lead there.
-                changed = vehicle.controller.motion.origin[1] != vehicle.cell[1] == lane
-                beside = _is_beside(vehicle, other.rear_m, other.s_m)
-                if changed and beside and lane in vehicle.lanes_touched:
-                    text = f"changes lanes beside {other.name}, at {other.s_m:.1f} m"
-                    self._checker.beyond_end(now_s, vehicle.name, text)
+
+    def _check_change(self, vehicle: LightVehicle, held: Cell, now_s: float) -> None:
+        """Report a lane change that begins beside a fast vehicle of another system, or before it.
+
+        Sensors do not look back, and the fast one would have to brake.
+        """
+        lattice = self._scenario.lattice
+        lane, t_s = vehicle.cell[1], now_s - self.began_s
+        for other in self._roadside.obstacles.passing.on_road:
+            if other.passage.lane != lane or other.speed_mps < lattice.speed_mps:
+                continue
+            ahead_m = lattice.cell_s_m(max(held[0], vehicle.cell[0]), t_s) - other.rear_m
+            needed_m = gap_needed_m(other.speed_mps, lattice.speed_mps) - 2.0 * PREDICTED_M
+            if 0.0 < ahead_m < other.length_m + vehicle.size[0] + needed_m:
+                text = f"changes to lane {lane} {ahead_m:.1f} m before the rear of {other.name}"
+                self._checker.beyond_end(now_s, vehicle.name, text)
 
     def _without_room(self, from_m: float) -> set[Name]:
         """Return the vehicles that would brake for what they sense, unlike light bodies.
