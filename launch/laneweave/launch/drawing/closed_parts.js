@@ -56,5 +56,33 @@ const laneweaveClosed = (() => {
     pen.restore();
   }
 
-  return { closedParts };
+  /** Draw parts [lane, from, to, kind] that are closed for a time, or cleared, and other vehicles. */
+  function temporary(parts, others) {
+    return (painter) => {
+      const { pen, theme } = painter;
+      const { lane_width_m: width } = painter.scene.road;
+      const high = painter.y(0) - painter.y(width);
+      for (const [lane, from, to, kind] of parts) {
+        if (!painter.shows(from, to)) continue;
+        const top = painter.y((lane + 1) * width);
+        if (kind === 1) {
+          hatch(painter, from, to, top, high);
+          continue;
+        }
+        pen.fillStyle = pen.strokeStyle = theme.faint;
+        pen.globalAlpha = 0.18;
+        pen.fillRect(painter.x(from), top, painter.x(to) - painter.x(from), high);
+        pen.globalAlpha = 1;
+      }
+      pen.fillStyle = theme.ink;
+      for (const [, lane, front, length] of others) {
+        if (!painter.shows(front - length, front)) continue;
+        const top = painter.y((lane + 0.78) * width);
+        const left = painter.x(front - length);
+        pen.fillRect(left, top, Math.max(4, painter.x(front) - left), 0.56 * high);
+      }
+    };
+  }
+
+  return { closedParts, temporary };
 })();

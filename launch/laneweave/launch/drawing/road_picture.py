@@ -49,16 +49,23 @@ def draw_lanes(
     axes.grid(visible=False)
 
 
-def draw_closed_parts(axes: Axes, scenario: Scenario) -> None:
-    """Draw closed parts with hatching, the stop lines before them, ramps and exits."""
+def draw_closed_part(
+    axes: Axes, lane: int, from_m: float, to_m: float, lane_width_m: float
+) -> None:
+    """Draw a closed part of a lane with hatching."""
     from matplotlib.patches import Rectangle  # noqa: PLC0415 - lazily
 
+    corner, length_m = (from_m, lane * lane_width_m), to_m - from_m
+    axes.add_patch(Rectangle(corner, length_m, lane_width_m, zorder=1.5, **CLOSED))
+
+
+def draw_closed_parts(axes: Axes, scenario: Scenario) -> None:
+    """Draw closed parts with hatching, the stop lines before them, ramps and exits."""
     width_m = scenario.road.lane_width_m
     for part in closed_parts(scenario):
-        corner, length_m = (part.from_m, part.lane * width_m), part.to_m - part.from_m
-        axes.add_patch(Rectangle(corner, length_m, width_m, zorder=1.5, **CLOSED))
+        draw_closed_part(axes, part.lane, part.from_m, part.to_m, width_m)
         if part.line_m is not None:
-            lane_m = (corner[1], corner[1] + width_m)
+            lane_m = (part.lane * width_m, (part.lane + 1) * width_m)
             axes.plot([part.line_m] * 2, lane_m, color=INK, linewidth=1.6, zorder=2)
     for lane, from_m, to_m in ramp_edges(scenario):
         axes.plot([from_m, to_m], [lane * width_m] * 2, color=INK, linewidth=1.6, zorder=2)

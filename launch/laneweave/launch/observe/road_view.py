@@ -20,6 +20,7 @@ from laneweave.protocol.scenario.deployment_fields import HIGHEST_PACE
 from laneweave.protocol.wire.bounds import Bounds
 from laneweave.protocol.wire.messages import Census, Heartbeat, Name, RoadClock, VehicleState
 from laneweave.protocol.wire.newest import NewestRoad
+from laneweave.protocol.wire.obstacle_messages import Obstacles
 from laneweave.protocol.wire.process_messages import LogEvent
 from laneweave.protocol.wire.topics import (
     BRIDGE_ALIVE,
@@ -79,6 +80,8 @@ class RoadView:
     clock: RoadClock | None = None
     """Newest clock."""
     census: Census | None = None
+    obstacles: Obstacles | None = None
+    """Newest parts of lanes that are not open as always."""
     leader: Name | None = None
     """Coordinator that last claimed to lead."""
     incarnation: int = 0
@@ -131,13 +134,9 @@ class RoadView:
                 self.update(message, now_s)
             case VehicleState():
                 self._on_state(event)
-            case RoadClock() | Census() if not self._is_of_newest_road(event, now_s):
-                pass
-            case RoadClock():
-                self._on_clock(event, now_s)
-            case Census():
-                if self.census is None or event.t_s >= self.census.t_s:
-                    self.census = event
+            case RoadClock() | Census() | Obstacles():
+                if self._is_of_newest_road(event, now_s):
+                    self._on_road(event, now_s)
             case Heartbeat():
                 self._on_heartbeat(event, now_s)
             case LogEvent():
@@ -148,6 +147,16 @@ class RoadView:
                 self.linked = isinstance(event, LinkUp)
             case _:
                 pass
+
+    def _on_road(self, message: RoadClock | Census | Obstacles, now_s: float) -> None:
+        """Keep a message about the newest road if none is newer."""
+        if isinstance(message, RoadClock):
+            self._on_clock(message, now_s)
+        elif isinstance(message, Census):
+            if self.census is None or message.t_s >= self.census.t_s:
+                self.census = message
+        elif self.obstacles is None or message.t_s >= self.obstacles.t_s:
+            self.obstacles = message
 
     def take_events(self) -> Iterator[LogEvent]:
         """Yield the log events that have arrived since the last call."""
@@ -200,7 +209,7 @@ class RoadView:
         """Incarnation of the newest bridge; -1: unknown."""
         return self.road.bridge
 
-    def _is_of_newest_road(self, message: RoadClock | Census, now_s: float) -> bool:
+    def _is_of_newest_road(self, message: RoadClock | Census | Obstacles, now_s: float) -> bool:
         """Return whether a message belongs to the newest road; start a new road if necessary."""
         number = self.road.number
         try:
@@ -211,7 +220,7 @@ class RoadView:
             return False
         if self.roads == 0 or self.road.number != number:
             if self.roads:
-                self.clock = self.first_clock = self.census = None
+                self.clock = self.first_clock = self.census = self.obstacles = None
                 self.states = {}
             self.roads += 1
         return is_newest

@@ -22,6 +22,7 @@ from laneweave.launch.drawing.figures import DPI, FAINT_INK, INK
 from laneweave.launch.drawing.road_picture import (
     CLOSED,
     draw_body,
+    draw_closed_part,
     draw_closed_parts,
     draw_lanes,
     draw_position_axis,
@@ -29,6 +30,7 @@ from laneweave.launch.drawing.road_picture import (
 )
 from laneweave.launch.drawing.road_scene import closed_parts, ramp_edges
 from laneweave.launch.formation_columns import Formations
+from laneweave.launch.recordings.closed_parts import ClosedForATime, closed_for_a_time
 from laneweave.launch.recordings.formations import closed_formations
 from laneweave.launch.recordings.runs import scenario_of
 from laneweave.launch.recordings.trajectories import (
@@ -86,15 +88,17 @@ def road_snapshots(
         folder: folder of the run.
         out: file of the picture; its suffix defines the format.
         times: road times [s]; empty: the four times, spaced by the shortest T_F, at which the most
-            vehicles change lanes.
-        stretch_m: (from m, to m); None: `default_stretch_m`.
+            vehicles change lanes; or those when a part of a lane is closed for a time.
+        stretch_m: (from m, to m); None: around this part, or else `default_stretch_m`.
         dpi: resolution in dots per inch.
     """
     scenario = scenario_of(folder / "trajectories.parquet")
     road = scenario.road
+    tracks, parts = read_tracks(folder), closed_for_a_time(folder)
+    if parts and not times and stretch_m is None:
+        stretch_m, times = _around(parts[0], scenario)
     if stretch_m is None:
         stretch_m = default_stretch_m(scenario)
-    tracks = read_tracks(folder)
     if not times:
         times = _instants(tracks, scenario, stretch_m)
     trips = read_trips(folder)
@@ -111,6 +115,10 @@ def road_snapshots(
         strips = figure.subplots(len(times), 1, sharex=True, squeeze=False)[:, 0]
         for axes, t_s in zip(strips, times, strict=True):
             _draw_road(axes, scenario, stretch_m)
+            for part in parts:
+                if part.since_s <= t_s < part.until_s:
+                    width_m = road.lane_width_m
+                    draw_closed_part(axes, part.lane, part.from_m, part.to_m, width_m)
             shaded |= _draw_formations(axes, scenario, stretch_m, formations, t_s)
             write_time(axes, f"{t_s:g} s")
             for number, name in enumerate(tracks.names):
@@ -123,7 +131,23 @@ def road_snapshots(
                     )
         draw_position_axis(strips[-1])
         starts = stretch_m[0] < scenario.geometry.moves_from_m < stretch_m[1]
-        _draw_legend(figure, scenario, starts=starts, shaded=shaded)
+        _draw_legend(figure, scenario, starts=starts, shaded=shaded, closed=bool(parts))
+
+
+def _around(
+    part: ClosedForATime, scenario: Scenario
+) -> tuple[tuple[float, float], tuple[float, ...]]:
+    """Return the stretch around a part that is closed for a time, and four instants.
+
+    They are when it is closed, while it is, and when the lane is used again.
+    """
+    road, slot_s = scenario.road, scenario.timing.cycles_s[0]
+    stretch_m = max(0.0, part.from_m - 0.7 * _LONG_M), min(road.length_m, part.to_m + 0.3 * _LONG_M)
+    until_s = min(part.until_s, part.since_s + 40.0 * slot_s)
+    shares = (0.03, 0.3, 0.75)
+    instants_s = [part.since_s + share * (until_s - part.since_s) for share in shares]
+    instants_s.append(until_s + 3.0 * slot_s)
+    return stretch_m, tuple(round(t_s, 1) for t_s in instants_s)
 
 
 def changes_gradually(tracks: Tracks, scenario: Scenario) -> bool:
@@ -280,7 +304,9 @@ def _draw_vehicle(
     )
 
 
-def _draw_legend(figure: Figure, scenario: Scenario, *, starts: bool, shaded: bool) -> None:
+def _draw_legend(
+    figure: Figure, scenario: Scenario, *, starts: bool, shaded: bool, closed: bool
+) -> None:
     """Draw the legend of colours and marks above the strips.
 
     Args:
@@ -288,6 +314,7 @@ def _draw_legend(figure: Figure, scenario: Scenario, *, starts: bool, shaded: bo
         scenario: scenario of the run.
         starts: whether the strips show the start of lane sorting.
         shaded: whether they show columns of formations.
+        closed: whether parts of lanes are closed for a time.
     """
     from matplotlib.lines import Line2D  # noqa: PLC0415 - lazily
     from matplotlib.patches import Patch  # noqa: PLC0415 - lazily
@@ -299,7 +326,7 @@ def _draw_legend(figure: Figure, scenario: Scenario, *, starts: bool, shaded: bo
     ]
     shades = f"darker: slower than {speed_mps:g} m/s; lighter: faster"
     handles.append(Line2D([], [], linewidth=0.0, label=shades))
-    if scenario.road.closures:
+    if scenario.road.closures or closed:
         handles.append(Patch(label="closed", **CLOSED))
     if any(part.line_m is not None for part in closed_parts(scenario)):
         style: dict[str, Any] = {"marker": "|", "markersize": 9, "markeredgewidth": 1.6}

@@ -37,6 +37,8 @@ live frames are sent on request.
 | `formations` | closed formations on the road: list of [number, rear column, front column] |
 | `joined` | lists of the numbers of formations that plan together |
 | `vehicles` | list of rows, one per vehicle |
+| `parts` | parts of lanes: list of [lane, from, to, kind]; kind 1: closed for a time, 2: cleared |
+| `others` | vehicles of other systems: list of [name, lane, s of the front, length] (only live) |
 
 **Row** of a vehicle: `[name, s, y, speed, lane, formation, hold, target, flags, owned]`: s of the
 front bumper, y of the body centre, preferred lane (-1: none, or unknown), number of the closed
@@ -80,6 +82,9 @@ MAX_REQUESTED: Final = 50
 """Maximum number of frames in a response."""
 MOVING, UNATTENDED, UNHEARD, OVERDUE = 1, 2, 4, 8
 """Flags of vehicles."""
+
+CLOSED_PART, CLEARED_PART = 1, 2
+"""Kinds of parts of lanes."""
 
 MAX_FRAMES: Final = 3000
 """Five minutes at ten frames per second."""
@@ -238,6 +243,11 @@ class Row:
             [part for cell in self.owned for part in cell],
             *([self.vehicle_type] if self.vehicle_type != CAR else []),
         ]
+
+
+def part_row(lane: int, from_m: float, to_m: float, kind: int) -> list[Any]:
+    """Return a row of the field `parts` of a frame."""
+    return [lane, round(from_m, 1), round(to_m, 1), kind]
 
 
 def scene_of(scenario: Scenario, kind: str, title: str, step_s: float) -> dict[str, Any]:

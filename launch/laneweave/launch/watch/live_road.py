@@ -16,12 +16,15 @@ from laneweave.launch.observe.findings import Finding, Findings
 from laneweave.launch.observe.observed import NOTHING, Expected
 from laneweave.launch.observe.road_view import RoadView, claims_of
 from laneweave.launch.watch.frames import (
+    CLEARED_PART,
+    CLOSED_PART,
     MOVING,
     OVERDUE,
     UNATTENDED,
     UNHEARD,
     EventFeed,
     Row,
+    part_row,
     plan_row,
 )
 from laneweave.protocol.lattice import Cell
@@ -35,13 +38,14 @@ from laneweave.protocol.wire.topics import (
     CLOCK,
     EVENT,
     HEARTBEAT,
+    OBSTACLES,
     PLAN,
     ROAD_STATUS,
     SETTINGS,
     STATE,
 )
 
-TOPICS = (STATE, CLOCK, CENSUS, HEARTBEAT, PLAN, EVENT, ROAD_STATUS, SETTINGS)
+TOPICS = (STATE, CLOCK, CENSUS, OBSTACLES, HEARTBEAT, PLAN, EVENT, ROAD_STATUS, SETTINGS)
 """Subscribed topics, most frequent first."""
 UNHEARD_S = 1.0
 """Age (road time) of the newest state above which a vehicle counts as not heard from."""
@@ -129,7 +133,23 @@ class LiveRoad:
                 {state.record.joined for state in view.states.values()}, self.scenario.lattice
             ),
             "vehicles": [row.compact() for row in rows],
+            **self._obstacles(clock.t_s if clock is not None else 0.0),
         }
+
+    def _obstacles(self, t_s: float) -> dict[str, Any]:
+        """Return the fields `parts` and `others`."""
+        message = self.view.obstacles
+        if message is None:
+            return {"parts": [], "others": []}
+        parts = [part_row(one.lane, one.from_m, one.to_m, CLOSED_PART) for one in message.parts]
+        others = []
+        for one, part in zip(message.cleared, message.temporary.cleared, strict=True):
+            parts.append(part_row(one.lane, *part.at(t_s), CLEARED_PART))
+            if one.length_m > 0.0:
+                front_m = one.front_m + one.speed_mps * (t_s - one.at_s)
+                row = [one.vehicle, one.lane, round(front_m, 2), round(one.length_m, 2)]
+                others.append(row)
+        return {"parts": parts, "others": others}
 
     def _leadership(self, wall_s: float) -> dict[str, Any]:
         """Return the fields `leader` and `candidates`, for the newest process of each name."""

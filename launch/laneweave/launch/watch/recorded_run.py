@@ -7,9 +7,10 @@ moves are not recorded.
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from operator import itemgetter
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -22,11 +23,29 @@ from laneweave.launch.recordings.formations import closed_formations, read_event
 from laneweave.launch.recordings.runs import not_a_run, single_run
 from laneweave.launch.recordings.trajectories import NO_LATTICE, Tracks, read_tracks, read_trips
 from laneweave.launch.run_methods import FORMATION
-from laneweave.launch.watch.frames import MOVING, EventFeed, Row, compact, plan_row, scene_of
+from laneweave.launch.watch.frames import (
+    CLOSED_PART,
+    MOVING,
+    EventFeed,
+    Row,
+    compact,
+    part_row,
+    plan_row,
+    scene_of,
+)
 from laneweave.protocol.lattice import Cell
+from laneweave.protocol.road_layout import LanePosition
 from laneweave.protocol.vehicle.lane_ends import LaneEnds
-from laneweave.protocol.wire.events import ENTERED, FORMATIONS_JOINED, LEADER, LEFT
+from laneweave.protocol.wire.events import (
+    ENTERED,
+    FORMATIONS_JOINED,
+    LEADER,
+    LEFT,
+    PART_CLOSED,
+    PART_OPENED,
+)
 from laneweave.protocol.wire.messages import CAR
+from laneweave.protocol.wire.obstacle_messages import PASSING
 
 STEP_S = 0.2
 """Road time between two frames; the page interpolates."""
@@ -46,6 +65,8 @@ class _Moment:
     left: int = 0
     joined: tuple[tuple[int, ...], ...] = ()
     """Groups of blocks whose formations plan together."""
+    closed: Mapping[LanePosition, float] = MappingProxyType({})
+    """End of each part that is closed for a time, by lane and beginning."""
 
 
 class Recording:
@@ -107,6 +128,11 @@ class Recording:
             "formations": [[one.number, one.rear, one.front] for one in shown.listed],
             "joined": shown.joined(moment.joined, self._run.scenario.lattice),
             "vehicles": [row.compact() for row in rows],
+            "parts": [
+                part_row(lane, from_m, to_m, CLOSED_PART)
+                for (lane, from_m), to_m in moment.closed.items()
+            ],
+            "others": [],
         }
 
     def _vehicles(self, number: int, t_s: float) -> Iterator[Row]:
@@ -172,5 +198,11 @@ def _moments(folder: Path) -> Iterator[_Moment]:
             joined = (*joined, tuple(map(int, data["formations"])))
         plan = plan_row(t_s, kind, data) or moment.plan
         entered, left = moment.entered + (kind == ENTERED), moment.left + (kind == LEFT)
-        moment = _Moment(t_s, leader, plan, tuple(feed.rows), entered, left, joined)
+        closed = moment.closed
+        # Where vehicles of other systems are is not recorded.
+        if kind in (PART_CLOSED, PART_OPENED) and data.get("cause") != PASSING:
+            at = int(data["lane"]), float(data["from_m"])
+            rest = {each: to_m for each, to_m in closed.items() if each != at}
+            closed = rest | ({at: float(data["to_m"])} if kind == PART_CLOSED else {})
+        moment = _Moment(t_s, leader, plan, tuple(feed.rows), entered, left, joined, closed)
         yield moment

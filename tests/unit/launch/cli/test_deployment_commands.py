@@ -41,7 +41,7 @@ def test_certificates_for_a_deployment(laneweave: Here, config: Path) -> None:
     assert (status, errors) == (0, [])
     names = {path.stem for path in folder.glob("*.pem")}
     assert names == {"ca", "router", "bridge", "coordinator.c1", "coordinator.c2", "fleet.left",
-                     "fleet.right", "client.plan", "observer.ping",
+                     "fleet.right", "client.plan", "operator.operator", "observer.ping",
                      "observer.status", "observer.watch"}  # fmt: skip
     for name in names:
         assert stat.S_IMODE((folder / f"{name}.key").stat().st_mode) == 0o600

@@ -250,7 +250,8 @@ class Watch {
     const picture = laneweaveFrames.between(frame, next, share);
     this.picture = picture;
     const { t, bodies } = picture;
-    const layers = [laneweaveClosed.closedParts];
+    const { parts, others } = this.current;
+    const layers = [laneweaveClosed.closedParts, laneweaveClosed.temporary(parts, others)];
     if (t !== null) {
       const { formations, joined } = this.current;
       layers.push(laneweaveLayers.blocks(formations, joined, t));
