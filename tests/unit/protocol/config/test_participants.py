@@ -19,7 +19,8 @@ def test_the_identities_of_a_deployment() -> None:
     )
     names = {identity.common_name for identity in identities_of(scenario)}
     assert names == {"router", "bridge", "coordinator.c1", "coordinator.c2", "fleet.f", "client.x",
-                     "operator.operator", "vehicle.a", "observer.ping", "observer.status", "observer.watch"}  # fmt: skip
+                     "operator.operator", "vehicle.a",
+                     "observer.ping", "observer.status", "observer.watch"}  # fmt: skip
 
 
 @for_each("volume", [20.0, 400.0, 1600.0, 3600.0])
