@@ -6,7 +6,6 @@ from typing import Any
 
 from attrs import define, evolve, field
 
-from laneweave.protocol.road_layout import LanePosition
 from laneweave.protocol.summary import ObstacleFigures
 from laneweave.protocol.wire.events import ENTERED_LATTICE, LEFT_LATTICE, PART_OPENED
 from laneweave.protocol.wire.messages import Name
@@ -18,14 +17,14 @@ class ObstacleLog:
     """The closed parts of a run."""
 
     _figures: list[ObstacleFigures] = field(factory=list)
-    _active: dict[LanePosition, int] = field(factory=dict)
-    """Index in `_figures` of each part that is closed now, by lane and beginning."""
+    _active: dict[tuple[int, float, Name | None], int] = field(factory=dict)
+    """Index in `_figures` of each part that is closed now, by lane, beginning and vehicle."""
     _waits: dict[Name, tuple[int, float]] = field(factory=dict)
     """Index of the part at which each vehicle waits, and road time since which it does."""
 
     def on_obstacle(self, t_s: float, kind: str, obstacle: Obstacle) -> None:
         """Note that a part is closed, is longer or shorter than before, or is open again."""
-        place = obstacle.lane, obstacle.from_m
+        place = obstacle.lane, obstacle.from_m, obstacle.vehicle
         number = self._active.setdefault(place, len(self._figures))
         if number == len(self._figures):
             self._figures.append(

@@ -163,6 +163,10 @@ class PassingVehicles:
                 self.on_road.remove(one)
                 self._changes.append((PART_OPENED, one.recorded))
         for passage in [one for one in self._pending if t_s >= one.at_s]:
+            if passage.until_s is not None and t_s >= passage.until_s:
+                self._pending.remove(passage)  # it has found no room
+                self._announced.pop(id(passage), None)
+                continue
             if id(passage) not in self._announced:
                 self._announced[id(passage)] = self._cleared_before(passage, t_s)
             if self._has_room(passage, vehicles, t_s):

@@ -13,6 +13,7 @@ from laneweave.protocol.wire.events import PART_CLOSED, PART_OPENED
 from laneweave.protocol.wire.messages import Command, CurrentMotion, Name, VehicleRecord
 from laneweave.protocol.wire.obstacle_messages import PASSING, Obstacle
 from laneweave.sim_bridge.bodies.stop_lines import StopLinesAhead
+from laneweave.sim_bridge.recording.obstacle_log import ObstacleLog
 from laneweave.sim_bridge.road.passing_vehicles import (
     CLEARED_BEHIND_M,
     PassingVehicle,
@@ -63,7 +64,8 @@ def check_parts(road: LonelyRoad) -> None:
             assert not fast
             assert any(part.from_m <= one.s_m and one.s_m <= part.to_m for part in slow)
         elif fast:
-            assert not slow
+            # While it waits behind others, it is slow, too; parts at which vehicles wait stay.
+            assert not slow or one.lowest_mps < lattice_mps
             (cleared,) = fast
             moved_m = cleared.speed_mps * (road.t_s - cleared.at_s)
             assert abs(cleared.front_m + moved_m - one.s_m) < 10.0
@@ -105,6 +107,24 @@ def test_a_fast_vehicle_brakes_for_those_that_do_not_leave_its_lane(
     assert left.speed_mps <= 15.1
     assert left_s - entered_s < (road.scenario.road.length_m / 15.0) * 1.5
     assert max(road.events, default=None) is None
+
+
+def test_several_vehicles_pass_one_after_the_other_in_one_lane() -> None:
+    first, second = evolve(SLOW, for_s=50.0), evolve(SLOW, for_s=50.0, speed_mps=8.0)
+    road, log = lonely_road(first, second, FAST), ObstacleLog()
+    for t_s, kind, obstacle in run_to_end(road):
+        log.on_obstacle(t_s, kind, obstacle)
+    assert log.figures is not None
+    assert len(log.figures) == 3
+    assert len({one.vehicle for one in log.figures}) == 3
+    assert all(one.opened_s is not None and one.opened_s > one.since_s for one in log.figures)
+
+
+def test_a_vehicle_that_finds_no_room_until_its_time_is_over_does_not_enter() -> None:
+    blocked = evolve(FAST, until_s=21.0)
+    road = lonely_road(blocked, volume=1500.0)
+    assert run_to_end(road) == []
+    assert road.roadside.obstacles.cleared == ()
 
 
 def test_no_vehicle_enters_a_lane_that_is_cleared() -> None:
