@@ -277,10 +277,13 @@ def cleared_parts_are_entered(*_: object) -> bool:
 
 @breaks(PASSING_VEHICLES, PassingVehicles, "_closed_around")
 def closed_parts_do_not_move(
-    closed_around: Callable[..., TemporaryClosure], self: PassingVehicles, one: PassingVehicle
+    closed_around: Callable[..., TemporaryClosure],
+    self: PassingVehicles,
+    one: PassingVehicle,
+    *rest: object,
 ) -> TemporaryClosure:
     """The part that is closed around a slow vehicle stays where the vehicle has entered."""
-    return one.closed or closed_around(self, one)
+    return one.closed or closed_around(self, one, *rest)
 
 
 @breaks(PASSING_VEHICLES, PassingVehicle, "step")

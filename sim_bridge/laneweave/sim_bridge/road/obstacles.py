@@ -162,9 +162,15 @@ class Obstacles:
         """Return where those begin whose cause is over, although vehicles still wait there.
 
         While another part that is still closed is so near ahead that a vehicle that has started
-        would pass its stop line before it is in its cell, vehicles wait for that one, too.
+        would pass its stop line before it is in its cell, vehicles wait for that one, too; but not
+        for a vehicle of another system that stands, since it waits for them.
         """
-        closed = [one.part for one in self.active if not one.is_over(t_s)]
+        closed = [
+            one.part
+            for one in self.active
+            if not one.is_over(t_s)
+            and not (one.vehicle is not None and self.passing.stands(one.vehicle))
+        ]
         settles_m = re_entry(self._scenario).distance_m if self.active else 0.0
 
         def is_free(part: TemporaryClosure) -> bool:

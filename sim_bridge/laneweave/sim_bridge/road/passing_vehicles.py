@@ -23,6 +23,7 @@ from laneweave.protocol.wire.events import PART_CLOSED, PART_OPENED
 from laneweave.protocol.wire.messages import Name
 from laneweave.protocol.wire.obstacle_messages import PASSING, Cleared, Obstacle
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import Size
+from laneweave.sim_bridge.bodies.stop_lines import STANDING_MPS
 from laneweave.sim_bridge.road.vehicles_in_part import (
     BodyOnRoad,
     cleared_before_m,
@@ -36,6 +37,8 @@ WAITING = 0.95
 behind them."""
 AHEAD_M = 1.0
 """How far a closed part reaches beyond the front of a slow vehicle."""
+TOUCH_M = 0.1
+"""Minimum distance from its front to the end of the part."""
 MIN_GAP_M = 2.0
 """Gap behind a vehicle that stands."""
 ACCEL_MPS2, BRAKING_MPS2, HARDEST_MPS2 = 1.5, 4.0, 9.0
@@ -185,8 +188,8 @@ class PassingVehicles:
                 one.cleared = self._cleared_for(one, t_s)
             if fast and one.speed_mps >= WAITING * self._scenario.lattice.speed_mps:
                 one.closed = None
-            elif one.closed is None or slot != self._slot:
-                one.closed = self._closed_around(one)
+            elif one.closed is None or slot != self._slot or one.s_m >= one.closed.to_m:
+                one.closed = self._closed_around(one, vehicles.values())
         self._slot = slot
 
     def step(self, vehicles: Iterable[BodyOnRoad], tick_s: float) -> None:
@@ -274,11 +277,28 @@ class PassingVehicles:
             one.length_m,
         )
 
-    def _closed_around(self, one: PassingVehicle) -> TemporaryClosure:
-        """Return the part of a lane in which a slow vehicle is up to the end of the next slot."""
+    def _closed_around(
+        self, one: PassingVehicle, vehicles: Iterable[BodyOnRoad]
+    ) -> TemporaryClosure:
+        """Return the part of a lane in which a slow vehicle is up to the end of the next slot.
+
+        It ends behind vehicles that wait ahead of it: they do not wait for it.
+        """
         speed_mps = min(one.passage.speed_mps, self._scenario.lattice.speed_mps)
         ahead_m = 2.0 * self._scenario.timing.cycles_s[0] * speed_mps + AHEAD_M
-        return TemporaryClosure(one.passage.lane, one.rear_m, one.s_m + ahead_m)
+        rears_m = [
+            vehicle.state[0] - vehicle.size[0]
+            for vehicle in vehicles
+            if not vehicle.has_cell
+            and one.passage.lane in vehicle.lanes_used
+            and vehicle.state[0] > one.s_m
+        ]
+        to_m = min([one.s_m + ahead_m, *rears_m])
+        return TemporaryClosure(one.passage.lane, one.rear_m, max(to_m, one.s_m + TOUCH_M))
+
+    def stands(self, name: Name) -> bool:
+        """Return whether a vehicle stands, behind others."""
+        return any(one.name == name and one.speed_mps < STANDING_MPS for one in self.on_road)
 
     def pop_changes(self) -> list[tuple[str, Obstacle]]:
         """Return the vehicles that have entered or left since the last call."""

@@ -62,7 +62,8 @@ def check_parts(road: LonelyRoad) -> None:
         if one.passage.speed_mps < lattice_mps:
             # The vehicle is within the newest of the parts that are closed for it.
             assert not fast
-            assert any(part.from_m <= one.s_m and one.s_m <= part.to_m for part in slow)
+            ahead_m = one.speed_mps * TICK_S
+            assert any(part.from_m <= one.s_m <= part.to_m + ahead_m for part in slow)
         elif fast:
             # While it waits behind others, it is slow, too; parts at which vehicles wait stay.
             assert not slow or one.lowest_mps < lattice_mps
