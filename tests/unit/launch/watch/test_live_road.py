@@ -13,14 +13,15 @@ from laneweave.launch.observe.observed import Expected
 from laneweave.launch.watch.frames import UNATTENDED, UNHEARD, compact
 from laneweave.launch.watch.live_road import STILL_S, LiveRoad
 from laneweave.protocol.config.scenario_files import parse_scenario
-from laneweave.protocol.runtime.node import PeerUp
+from laneweave.protocol.runtime.node import Arrived, PeerUp
 from laneweave.protocol.runtime.transport import LinkDown, LinkUp
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.lane_ends import dead_ends
 from laneweave.protocol.wire.codec import decode, encode
 from laneweave.protocol.wire.messages import ClosedFormation, Heartbeat, Name, RoadClock
+from laneweave.protocol.wire.obstacle_messages import PASSING, Cleared, Obstacle, Obstacles
 from laneweave.protocol.wire.process_messages import LogEvent, RoadStatus
-from laneweave.protocol.wire.topics import BRIDGE_ALIVE
+from laneweave.protocol.wire.topics import BRIDGE_ALIVE, OBSTACLES
 from support.closed_lanes import DROP
 from support.convoy import BALLOT, ROLLING, Convoy
 from support.states import changed
@@ -329,3 +330,19 @@ def test_what_is_wrong_is_in_the_frame() -> None:
         "there is no leader: no coordinators found",
         "1 vehicle has no agent, such as v1 for 12 s",
     ]
+
+
+def test_closed_and_cleared_parts_and_vehicles_of_other_systems_are_shown_where_they_are() -> None:
+    road = watched()
+    t_s = shown(road)["t"]
+    assert (shown(road)["parts"], shown(road)["others"]) == ([], [])
+    cleared = Cleared(2, 100.0, 300.0, 25.0, t_s - 1.0, PASSING, Name("other-1"), 120.0, 7.0)
+    message = Obstacles(t_s, (Obstacle(1, 600.0, 650.0),), cleared=(cleared,))
+    road.update(Arrived(OBSTACLES, {}, message), 2.0)
+    frame = shown(road)
+    assert frame["parts"] == [[1, 600.0, 650.0, 1], [2, 125.0, 325.0, 2]]
+    assert frame["others"] == [["other-1", 2, 145.0, 7.0]]
+    road.update(Arrived(OBSTACLES, {}, Obstacles(t_s - 5.0)), 2.0)  # an older one
+    assert len(shown(road)["parts"]) == 2
+    road.update(Arrived(OBSTACLES, {}, Obstacles(t_s + 0.1)), 2.0)
+    assert (shown(road)["parts"], shown(road)["others"]) == ([], [])

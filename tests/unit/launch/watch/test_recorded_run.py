@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from attrs import evolve
 
+from laneweave.launch.recordings.closed_parts import ClosedForATime, closed_for_a_time
 from laneweave.launch.recordings.runs import single_run
 from laneweave.launch.recordings.trajectories import read_tracks
 from laneweave.launch.watch.frames import MOVING
@@ -127,6 +128,23 @@ def test_cells_beyond_a_stop_line_are_not_shown(recorded: Path) -> None:
             seen[not row[6]] += 1
             assert row[6] or row[1] > end.line_m - scenario.lattice.pitch_m
     assert min(seen) > 50
+
+
+def closing(t_s: float, kind: str, to_m: float = 450.0, cause: str = "closed") -> str:
+    event = {"t_s": t_s, "kind": kind, "role": "bridge", "lane": 1, "from_m": 400.0, "to_m": to_m}
+    return json.dumps(event | {"cause": cause}) + "\n"
+
+
+def test_parts_are_shown_while_they_are_closed(recorded: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    shutil.copytree(recorded, folder)
+    with (folder / "events.jsonl").open("a") as events:
+        events.write(closing(2.0, "part-closed") + closing(3.0, "part-closed", 440.0))
+        events.write(closing(2.5, "part-closed", 300.0, "passing") + closing(6.0, "part-opened"))
+    recording = Recording(folder)
+    parts = [recording.frame(number)["parts"] for number in (5, 12, 20, 40)]
+    assert parts == [[], [[1, 400.0, 450.0, 1]], [[1, 400.0, 440.0, 1]], []]
+    assert closed_for_a_time(folder) == [ClosedForATime(1, 400.0, 450.0, 2.0, 6.0)]
 
 
 def test_there_are_no_frames_before_and_after(recorded: Path) -> None:
