@@ -110,7 +110,7 @@ class LonelyRoad:
         self.roadside.assign_empty_cells(self.vehicles)
         for vehicle in self.vehicles.values():
             vehicle.step(self.tick)
-        self.roadside.obstacles.passing.step(self.vehicles.values(), scenario.runtime.tick_s)
+        self.roadside.obstacles.step(self.vehicles.values(), t_s)
         self.tick += 1
         exits = Exits(scenario.geometry.sections, scenario.road.length_m)
         for name, vehicle in list(self.vehicles.items()):

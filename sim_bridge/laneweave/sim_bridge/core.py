@@ -306,6 +306,7 @@ class BridgeCore:
                     yield from (sense for _ in copies)
             case Stopping():
                 # While the bridge waits for final reports, the run itself has ended.
+                yield from self._desk.close()
                 shutting_down = self.phase is TickPhase.SHUTTING_DOWN
                 self._finish(self._ending if shutting_down else Ending.INTERRUPTED)
             case _:

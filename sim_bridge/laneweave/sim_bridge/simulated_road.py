@@ -206,7 +206,7 @@ class SimulatedRoad(Generic[VehicleT]):
             vehicle.step(tick)
             if vehicle.controller.refusal is not None:
                 self._record_refusal(vehicle)
-        self._roadside.obstacles.passing.step(self.vehicles.values(), self.scenario.runtime.tick_s)
+        self._roadside.obstacles.step(self.vehicles.values(), self.t_s)
         self.tick += 1
 
     def _record_refusal(self, vehicle: RoadVehicle) -> None:

@@ -142,6 +142,8 @@ def ask(settings: Scenario, name: str, request: RoadRequest) -> RoadResponse:
                 answer = transport.query(key, payload, wait_s, JSON.encoding).result()
             except TimeoutError:
                 text = f"the bridge at {where} has not answered within {wait_s:g} s"
+                if request.action == CLOSE:
+                    text += "; it may still close the lane (laneweave road open)"
                 raise CommandFailedError(text) from None
             if answer is None:
                 time.sleep(PAUSE_S)

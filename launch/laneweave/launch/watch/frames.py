@@ -38,7 +38,7 @@ live frames are sent on request.
 | `joined` | lists of the numbers of formations that plan together |
 | `vehicles` | list of rows, one per vehicle |
 | `parts` | parts of lanes: list of [lane, from, to, kind]; kind 1: closed for a time, 2: cleared |
-| `others` | vehicles of other systems: list of [name, lane, s of the front, length] (only live) |
+| `others` | fast vehicles of other systems: list of [name, lane, s of the front, length] (live) |
 
 **Row** of a vehicle: `[name, s, y, speed, lane, formation, hold, target, flags, owned]`: s of the
 front bumper, y of the body centre, preferred lane (-1: none, or unknown), number of the closed

@@ -44,7 +44,7 @@ class RoadEvent:
     """Road time from which it is closed."""
     until_s: float | None = field(default=None, validator=within_or_none(0.0, 1e6))
     """Road time until which it is closed; by default, for ever."""
-    for_s: float | None = field(default=None, validator=within_or_none(0.0, 1e6))
+    for_s: float | None = field(default=None, validator=within_or_none(0.0, 1e6, open_low=True))
     """Time after which it is opened again, unless `until_s` is earlier."""
     speed_mps: float = field(default=0.0, validator=within(0.0, 60.0))
     """Speed of a vehicle of another system; 0: a closed part."""

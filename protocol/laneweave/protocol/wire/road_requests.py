@@ -21,7 +21,7 @@ LONGEST_CLEAR_S = 600.0
 """Longest time for which a lane is cleared."""
 
 _position = within(0.0, LONGEST_ROAD_M)
-_time = within(0.0, 1e6)
+_time = within(0.0, 1e6, open_low=True)
 
 
 @frozen(kw_only=True)

@@ -18,7 +18,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from attrs import define, frozen
 
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.road_layout import LanePosition, TemporaryClosure
+from laneweave.protocol.road_layout import ClearedPart, LanePosition, TemporaryClosure
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.lane_end import LaneEnd
 from laneweave.protocol.vehicle.lane_ends import (
@@ -81,6 +81,7 @@ class LaneEndControl:
         self._lattice = scenario.lattice
         self._queue_m = queue_pitch_m(scenario)
         self._any = False
+        self._cleared: tuple[ClearedPart, ...] = ()
         self._ends: dict[LanePosition, LaneEnd] = {}
         """Dead ends by lane and end; those that have vanished as long as vehicles wait there."""
         self._beside: dict[LanePosition, int | None] = {}
@@ -103,7 +104,7 @@ class LaneEndControl:
             lane_ends: those of the road, and of parts that are closed for a time.
             closed: these parts. One may vanish only when no vehicle waits there (`in_use`).
         """
-        scenario = self._scenario
+        scenario, self._cleared = self._scenario, lane_ends.temporary.cleared
         self._ends = {(end.lane, end.end_m): end for end in lane_ends}
         self._any = bool(lane_ends)
         if self._ends:
@@ -268,7 +269,15 @@ class LaneEndControl:
         s_m, speed_mps = vehicle.state[0], vehicle.state[1]
         if speed_mps > STANDING_MPS:
             return
+        settles_s = 2.0 * self._distance_m / self._lattice.speed_mps
         for gap in gaps:
+            if any(
+                part.lane == gap.lane
+                and part.at(t_s)[0] < s_m + self._distance_m
+                and part.at(t_s + settles_s)[1] > s_m - vehicle.size[0]
+                for part in self._cleared
+            ):
+                continue  # for a fast vehicle of another system
             passed_s = t_s - self._lattice.passing_time_s(gap.columns[-1], s_m)
             if gap.vehicle is None and 0.0 <= passed_s <= START_S and self._is_free(vehicle, gap):
                 gap.vehicle = vehicle.name

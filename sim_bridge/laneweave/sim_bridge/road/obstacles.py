@@ -39,6 +39,7 @@ from laneweave.sim_bridge.bodies.stop_lines import STANDING_MPS
 from laneweave.sim_bridge.road.passing_vehicles import PassingVehicles
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
 from laneweave.sim_bridge.road.vehicles_in_part import (
+    BodyOnRoad,
     VehiclesInPart,
     cleared_before_m,
     vehicles_in_part,
@@ -169,7 +170,7 @@ class Obstacles:
             one.part
             for one in self.active
             if not one.is_over(t_s)
-            and not (one.vehicle is not None and self.passing.stands(one.vehicle))
+            and not (one.vehicle is not None and self.passing.is_blocked(one.vehicle))
         ]
         settles_m = re_entry(self._scenario).distance_m if self.active else 0.0
 
@@ -226,6 +227,11 @@ class Obstacles:
                 vehicle.controller.broken_mps2 = cause.decel_mps2
                 yield vehicle
 
+    def step(self, vehicles: Iterable[RoadVehicle], t_s: float) -> None:
+        """Move the vehicles of other systems by a tick, from road time `t_s` on."""
+        closed = self.without_vehicles(t_s) if self.passing else ()
+        self.passing.step(vehicles, closed, self._scenario.runtime.tick_s)
+
     def request(self, event: RoadEvent) -> None:
         """Close a part of a lane as soon as it has been cleared."""
         self._pending.append(event)
@@ -246,7 +252,8 @@ class Obstacles:
         self, part: TemporaryClosure, vehicles: Mapping[Name, RoadVehicle]
     ) -> VehiclesInPart:
         """Return the vehicles in the way of a part that is to be closed."""
-        return vehicles_in_part(self._scenario, *part[:3], vehicles.values())
+        everybody: list[BodyOnRoad] = [*vehicles.values(), *self.passing.on_road]
+        return vehicles_in_part(self._scenario, *part[:3], everybody)
 
     def _follow_passing(self, vehicles: Mapping[Name, RoadVehicle], t_s: float) -> None:
         """Close the parts in which slow vehicles of other systems are now; end earlier ones."""
@@ -295,7 +302,7 @@ class Obstacles:
 
         They stop before the part, and those at the line have room to start all the same.
         """
-        late, most_m = 0, self._room_ahead_m(part.lane, part.from_m)
+        late, most_m = 0, max(0.0, self._room_ahead_m(part.lane, part.from_m))
         behind = [
             vehicle.state[:2]
             for vehicle in vehicles.values()

@@ -39,10 +39,13 @@ AHEAD_M = 1.0
 """How far a closed part reaches beyond the front of a slow vehicle."""
 TOUCH_M = 0.1
 """Minimum distance from its front to the end of the part."""
+BLOCKED_M = 30.0
+"""Distance to the front of a vehicle that keeps one behind it from driving."""
 MIN_GAP_M = 2.0
 """Gap behind a vehicle that stands."""
-ACCEL_MPS2, BRAKING_MPS2, HARDEST_MPS2 = 1.5, 4.0, 9.0
-"""Acceleration; deceleration with which it plans to stop; maximum deceleration."""
+ACCEL_MPS2, BRAKING_MPS2, HARDEST_MPS2 = 1.5, 4.0, 6.0
+"""Acceleration; deceleration with which it plans to stop; maximum deceleration. It has no lag:
+the stopping distance is at least that of 10 m/s2 with the lag that followers assume."""
 REACTION_S = 1.0
 PREDICTED_M, PREDICTED_MPS = 5.0, 2.0
 """Errors of the published motion from which a new one is published."""
@@ -65,11 +68,38 @@ class PassingVehicle:
     """What is cleared for it."""
     closed: TemporaryClosure | None = None
     """The part of its lane that is closed around it."""
+    blocked: bool = False
+    """Whether it stands behind a vehicle that waits for a lane to be open again."""
 
     @property
     def length_m(self) -> float:
         """Length of the vehicle: that of the part of the lane in which it enters."""
         return self.passage.to_m - self.passage.from_m
+
+    @property
+    def state(self) -> State:
+        """(s [m], v [m/s], a [m/s2], y [m], v_y [m/s], a_y [m/s2]); y is not known here."""
+        return (self.s_m, self.speed_mps, self.accel_mps2, 0.0, 0.0, 0.0)
+
+    @property
+    def size(self) -> Size:
+        """Length of the vehicle [m]; its width is not known here."""
+        return (self.length_m, 0.0)
+
+    @property
+    def lanes_used(self) -> set[int]:
+        """Its lane."""
+        return {self.passage.lane}
+
+    @property
+    def has_cell(self) -> bool:
+        """It has none, but does not wait either."""
+        return True
+
+    @property
+    def waits(self) -> bool:
+        """It does not wait for a lane to be open again."""
+        return False
 
     @property
     def rear_m(self) -> float:
@@ -190,10 +220,21 @@ class PassingVehicles:
                 one.closed = None
             elif one.closed is None or slot != self._slot or one.s_m >= one.closed.to_m:
                 one.closed = self._closed_around(one, vehicles.values())
+            one.blocked = one.speed_mps < STANDING_MPS and any(
+                vehicle.waits
+                and one.passage.lane in vehicle.lanes_used
+                and 0.0 < vehicle.state[0] - one.s_m < BLOCKED_M
+                for vehicle in vehicles.values()
+            )
         self._slot = slot
 
-    def step(self, vehicles: Iterable[BodyOnRoad], tick_s: float) -> None:
-        """Move all vehicles by a tick."""
+    def step(
+        self,
+        vehicles: Iterable[BodyOnRoad],
+        closed: Iterable[TemporaryClosure],
+        tick_s: float,
+    ) -> None:
+        """Move all vehicles by a tick; they stop before parts that are `closed`."""
         if not self.on_road:
             return
         bodies = [
@@ -202,6 +243,7 @@ class PassingVehicles:
             for lane in one.lanes_used
         ]
         bodies += [(one.passage.lane, one.s_m, one.rear_m, one.speed_mps) for one in self.on_road]
+        bodies += [(part.lane, part.to_m, part.from_m, 0.0) for part in closed]
         for one in self.on_road:
             ahead = [
                 (rear_m - one.s_m, speed_mps)
@@ -219,8 +261,14 @@ class PassingVehicles:
         """
         lane, from_m, to_m = passage.lane, passage.from_m, passage.to_m
         waits = t_s < passage.at_s + passage.clear_s
-        if any(lane == one.passage.lane and one.rear_m <= to_m + MIN_GAP_M for one in self.on_road):
-            return False
+        for one in self.on_road:
+            if one.passage.lane != lane:
+                continue
+            if one.s_m <= from_m:
+                if not _follows(from_m, one.s_m, one.speed_mps, passage.speed_mps):
+                    return False
+            elif one.rear_m < to_m + gap_needed_m(passage.speed_mps, one.speed_mps):
+                return False
         if not self.is_fast(passage):
             found = vehicles_in_part(self._scenario, lane, from_m, to_m, vehicles.values())
             return found.allow_closing(waits=waits)
@@ -282,23 +330,22 @@ class PassingVehicles:
     ) -> TemporaryClosure:
         """Return the part of a lane in which a slow vehicle is up to the end of the next slot.
 
-        It ends behind vehicles that wait ahead of it: they do not wait for it.
+        It ends behind the next vehicle ahead: those ahead are not concerned.
         """
         speed_mps = min(one.passage.speed_mps, self._scenario.lattice.speed_mps)
         ahead_m = 2.0 * self._scenario.timing.cycles_s[0] * speed_mps + AHEAD_M
         rears_m = [
             vehicle.state[0] - vehicle.size[0]
             for vehicle in vehicles
-            if not vehicle.has_cell
-            and one.passage.lane in vehicle.lanes_used
-            and vehicle.state[0] > one.s_m
+            if one.passage.lane in vehicle.lanes_used and vehicle.state[0] > one.s_m
         ]
-        to_m = min([one.s_m + ahead_m, *rears_m])
+        last_m = self._scenario.road.length_m - TOUCH_M
+        to_m = min([one.s_m + ahead_m, last_m, *rears_m])
         return TemporaryClosure(one.passage.lane, one.rear_m, max(to_m, one.s_m + TOUCH_M))
 
-    def stands(self, name: Name) -> bool:
-        """Return whether a vehicle stands, behind others."""
-        return any(one.name == name and one.speed_mps < STANDING_MPS for one in self.on_road)
+    def is_blocked(self, name: Name) -> bool:
+        """Return whether a vehicle stands behind one that waits for a lane to be open again."""
+        return any(one.name == name and one.blocked for one in self.on_road)
 
     def pop_changes(self) -> list[tuple[str, Obstacle]]:
         """Return the vehicles that have entered or left since the last call."""

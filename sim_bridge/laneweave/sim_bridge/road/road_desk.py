@@ -40,6 +40,7 @@ from laneweave.sim_bridge.road.vehicle import RoadVehicle
 
 log = structlog.get_logger(__name__)
 
+HAS_ENDED = Refusal(REFUSED, "the road has ended", "")
 MAX_WAITING = 32
 """Maximum number of requests that wait until their parts have been cleared."""
 
@@ -65,6 +66,7 @@ class RoadDesk:
     _scenario: Scenario
     _obstacles: Obstacles
     _waiting: list[_Waiting] = field(factory=list)
+    _ended: bool = False
 
     def take(self, query: QueryArrived, t_s: float) -> Iterator[Reply]:
         """Handle a query; it is answered now, or once its part is closed.
@@ -74,6 +76,9 @@ class RoadDesk:
             t_s: road time.
         """
         form = format_of(query.payload, query.encoding)
+        if self._ended:
+            yield form.reply(query.token, HAS_ENDED)
+            return
         try:
             request = RoadRequest.from_dict(form.read(query.payload))
             if request.action != CLOSE:
@@ -105,9 +110,10 @@ class RoadDesk:
 
     def close(self) -> Iterator[Reply]:
         """Refuse all requests that wait: the run ends."""
+        self._ended = True
         waiting, self._waiting = self._waiting, []
         for one in waiting:
-            yield one.form.reply(one.token, Refusal(REFUSED, "the road has ended", ""))
+            yield one.form.reply(one.token, HAS_ENDED)
 
     def _event(self, request: RoadRequest, t_s: float) -> RoadEvent:
         """Return the event that a request asks for.

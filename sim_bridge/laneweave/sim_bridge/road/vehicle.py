@@ -111,6 +111,11 @@ class RoadVehicle:
         return self.controller.off_lattice is None
 
     @property
+    def waits(self) -> bool:
+        """Whether it waits for a lane to be open again; a vehicle that has broken down does not."""
+        return not self.has_cell and self.controller.broken_mps2 is None
+
+    @property
     def keeps_lane(self) -> bool:
         """Whether the body is in its lane, and no plan in force leads it out of its cell."""
         return self.controller.keeps_lane

@@ -35,6 +35,10 @@ class BodyOnRoad(Protocol):
     def has_cell(self) -> bool:
         """Whether it is on the lattice."""
 
+    @property
+    def waits(self) -> bool:
+        """Whether it waits for a lane to be open again."""
+
 
 @frozen
 class VehiclesInPart:
@@ -91,8 +95,8 @@ def vehicles_in_part(
             inside.append(vehicle.name)
         elif not vehicle.has_cell and from_m - s_m < room_m:
             near.append(vehicle.name)  # it would start into the part
-        elif stops_before(from_m, s_m, speed_mps):
-            coming.append(vehicle.name)
-        else:
+        elif not stops_before(from_m, s_m, speed_mps):
             near.append(vehicle.name)
+        elif not stops_before(from_m - room_m, s_m, speed_mps):
+            coming.append(vehicle.name)
     return VehiclesInPart(tuple(inside), tuple(near), tuple(coming))

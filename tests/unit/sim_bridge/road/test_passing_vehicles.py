@@ -121,6 +121,21 @@ def test_several_vehicles_pass_one_after_the_other_in_one_lane() -> None:
     assert all(one.opened_s is not None and one.opened_s > one.since_s for one in log.figures)
 
 
+@pytest.mark.parametrize(
+    "events",
+    [
+        (evolve(SLOW, from_m=120.0, to_m=127.0, speed_mps=3.0, for_s=40.0),
+         evolve(FAST, from_m=100.0, to_m=108.0)),
+        (evolve(SLOW, from_m=85.0, to_m=92.0, speed_mps=1.0, for_s=40.0),
+         evolve(FAST, speed_mps=40.0)),
+        (RoadEvent(1, 400.0, 450.0, 20.0, for_s=30.0, clear_s=0.0), FAST),
+    ],
+)  # fmt: skip
+def test_vehicles_brake_for_each_other_and_for_closed_parts(events: tuple[RoadEvent, ...]) -> None:
+    changes = run_to_end(lonely_road(*events, volume=400.0))
+    assert len([kind for _, kind, _ in changes if kind == PART_OPENED]) == 2
+
+
 def test_a_vehicle_that_finds_no_room_until_its_time_is_over_does_not_enter() -> None:
     blocked = evolve(FAST, until_s=21.0)
     road = lonely_road(blocked, volume=1500.0)
