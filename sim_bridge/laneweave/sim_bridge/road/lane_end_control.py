@@ -273,6 +273,7 @@ class LaneEndControl:
         for gap in gaps:
             if any(
                 part.lane == gap.lane
+                and part.speed_mps > 0.0  # at rest, it may wait for this vehicle
                 and part.at(t_s)[0] < s_m + self._distance_m
                 and part.at(t_s + settles_s)[1] > s_m - vehicle.size[0]
                 for part in self._cleared
