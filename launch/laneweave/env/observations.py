@@ -78,7 +78,7 @@ class Observer:
             t_s: road time of the end of the last tick.
         """
         not_granted, lanes = {*refused}, self.scenario.road.lanes
-        held = {one.cell: one for one in vehicles.values() if one.controller.off_lattice is None}
+        held = {one.cell: one for one in vehicles.values() if one.has_cell}
         columns = [column for column, _ in held] or [0]
         low = min(columns) - self.columns
         around = np.zeros((max(columns) + self.columns + 1 - low, lanes, len(PER_CELL)), np.float32)
@@ -89,7 +89,7 @@ class Observer:
         for name, vehicle in vehicles.items():
             first = vehicle.cell[0] - self.columns - low
             cells = np.zeros((2 * self.columns + 1, lanes, len(PER_CELL)), np.float32)
-            if vehicle.controller.off_lattice is None:
+            if vehicle.has_cell:
                 cells = around[first : first + 2 * self.columns + 1]
             own = self._own(vehicle, t_s, refused=name in not_granted)
             values = np.concatenate([np.array(own, np.float32), cells.ravel()])
@@ -102,11 +102,11 @@ class Observer:
         The road and its type allow the move, and it needs no cell that another vehicle holds.
         Requests that conflict with those of others are refused nevertheless.
         """
-        held = {one.cell for one in vehicles.values() if one.controller.off_lattice is None}
+        held = {one.cell for one in vehicles.values() if one.has_cell}
         found: dict[str, Mask] = {}
         for name, vehicle in vehicles.items():
             mask = self.only_hold()
-            if vehicle.controller.off_lattice is None:
+            if vehicle.has_cell:
                 planned = self._planned(name, vehicle, slot)
                 cell = planned.cell
                 for number, move in enumerate(self.moves):

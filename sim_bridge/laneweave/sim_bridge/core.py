@@ -305,8 +305,8 @@ class BridgeCore:
                     sense = self.road.sense_of(self.vehicles[name])  # encoded once
                     yield from (sense for _ in copies)
             case Stopping():
-                # While the bridge waits for final reports, the run itself has ended.
                 yield from self._desk.close()
+                # While the bridge waits for final reports, the run itself has ended.
                 shutting_down = self.phase is TickPhase.SHUTTING_DOWN
                 self._finish(self._ending if shutting_down else Ending.INTERRUPTED)
             case _:

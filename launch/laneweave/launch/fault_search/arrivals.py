@@ -136,4 +136,4 @@ class Arrivals:
 
 def _stands(vehicle: LightVehicle) -> bool:
     """Return whether a vehicle has stopped before the end of its lane."""
-    return vehicle.controller.off_lattice is not None
+    return not vehicle.has_cell

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Collection, Sequence
 
 import attrs
@@ -43,39 +44,46 @@ MAX_PASSING_M = 30.0
 
 def check_events(scenario: Scenario) -> None:
     """Check parts of lanes that are closed for a time, and vehicles of other systems."""
-    road = scenario.road
-    for number, event in enumerate(road.events):
-        name = f"road.events[{number}]"
-        allowed = f"a lane from 0 to {road.lanes - 1}"
-        require(event.lane < road.lanes, f"{name}.lane", event.lane, allowed)
-        allowed = f"more than from_m, {event.from_m:g}"
-        require(event.to_m > event.from_m, f"{name}.to_m", event.to_m, allowed)
-        allowed = f"more than at_s, {event.at_s:g}"
-        until_s = event.until_s
-        require(until_s is None or until_s > event.at_s, f"{name}.until_s", until_s, allowed)
-        if event.speed_mps:
-            _check_passage(scenario, name, event)
-        else:
-            check_part(scenario, f"{name}.", event.lane, event.from_m, event.to_m)
+    events = scenario.road.events
+    for number, event in enumerate(events):
+        check_event(scenario, f"road.events[{number}].", event)
     require(
-        not (road.events and scenario.sumo.config),
+        not (events and scenario.sumo.config),
         "road.events",
         Described("a table"),
         "none in a corridor of a SUMO simulation",
     )
 
 
-def check_part(scenario: Scenario, name: str, lane: int, from_m: float, to_m: float) -> None:
-    """Check that a part of a lane may be closed suddenly.
+def check_event(scenario: Scenario, name: str, event: RoadEvent) -> None:
+    """Check one of them.
 
     Raises:
-        BadInputError: it may not; `name` is that of the table with the fields.
+        BadInputError: it is not possible on this road; `name` precedes the name of the field.
     """
+    lanes = scenario.road.lanes
+    require(event.lane < lanes, f"{name}lane", event.lane, f"a lane from 0 to {lanes - 1}")
+    allowed = f"more than from_m, {event.from_m:g}"
+    require(event.to_m > event.from_m, f"{name}to_m", event.to_m, allowed)
+    allowed = f"more than at_s, {event.at_s:g}"
+    until_s = event.until_s
+    require(until_s is None or until_s > event.at_s, f"{name}until_s", until_s, allowed)
+    if event.speed_mps:
+        _check_passage(scenario, name, event)
+    else:
+        _check_part(scenario, name, event)
+
+
+def _check_part(scenario: Scenario, name: str, event: RoadEvent) -> None:
+    """Check that a part of a lane may be closed suddenly."""
+    from_m, to_m = event.from_m, event.to_m
     sections = [
-        (each, _last_m(scenario, each)) for each in scenario.geometry.sections if each.lane == lane
+        (each, _last_m(scenario, each))
+        for each in scenario.geometry.sections
+        if each.lane == event.lane
     ]
     needed_m = room_before_part_m(scenario, re_entry(scenario).room_m)
-    least_m = begins_m(scenario, lane, from_m) + needed_m
+    least_m = begins_m(scenario, event.lane, from_m) + needed_m
     places = " or ".join(
         f"{max(one.from_m, 0.0) + needed_m:g} to {last_m:g} m" for one, last_m in sections
     )
@@ -91,22 +99,19 @@ def check_part(scenario: Scenario, name: str, lane: int, from_m: float, to_m: fl
 def _check_passage(scenario: Scenario, name: str, event: RoadEvent) -> None:
     """Check a vehicle of another system: it drives in a lane that is open from end to end."""
     road = scenario.road
-    lanes = [each.lane for each in scenario.geometry.sections if each.from_m <= 0.0]
-    lanes = [
-        lane for lane in lanes if sum(one.lane == lane for one in scenario.geometry.sections) == 1
-    ]
-    require(event.lane in lanes, f"{name}.lane", event.lane, f"a lane without ends: {lanes}")
-    length_m = event.to_m - event.from_m
+    by_lane = Counter(each.lane for each in scenario.geometry.sections)
+    lanes = [lane for lane in road.first_lanes if by_lane[lane] == 1]
+    require(event.lane in lanes, f"{name}lane", event.lane, f"a lane without ends: {lanes}")
     require(
-        length_m <= MAX_PASSING_M,
-        f"{name}.to_m",
+        event.to_m - event.from_m <= MAX_PASSING_M,
+        f"{name}to_m",
         event.to_m,
         f"at most {MAX_PASSING_M:g} m beyond from_m: the length of a vehicle",
     )
     if event.speed_mps < scenario.formation.speed_mps:
-        check_part(scenario, f"{name}.", event.lane, event.from_m, event.to_m)
+        _check_part(scenario, name, event)
     else:
-        require(event.to_m < road.length_m, f"{name}.to_m", event.to_m, "a place on the road")
+        require(event.to_m < road.length_m, f"{name}to_m", event.to_m, "a place on the road")
 
 
 def _last_m(scenario: Scenario, section: LaneSection) -> float:

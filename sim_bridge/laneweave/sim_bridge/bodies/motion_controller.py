@@ -284,8 +284,8 @@ class MotionController:
         emergency, beside another body, before one that could not brake for it, or too late for an
         exit. A newer incarnation takes charge. Its first command must keep the hold cell: no plan
         can allow a process to move the vehicle before it is in charge. A rejected process may try
-        again at the next tick. One without jerks and with the current hold cell does not change the
-        motion.
+        again at the next tick. Commands without jerks and with the current hold cell do not change
+        the motion.
 
         Returns:
             Whether the command was accepted.

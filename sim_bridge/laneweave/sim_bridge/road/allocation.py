@@ -277,7 +277,7 @@ class CellAllocation:
             for entered, number, name in self._recent
             if first <= entered <= last
             and name in vehicles
-            and vehicles[name].controller.off_lattice is None
+            and vehicles[name].has_cell
             and (
                 self._keeps_cells(vehicles[name])
                 if self._is_last(point)
@@ -338,7 +338,7 @@ class CellAllocation:
             cells -= {
                 cell for cell in cells if lattice.passing_time_s(cell[0], self._length_m) < t_s
             }
-        on_lattice = [one for one in vehicles.values() if one.controller.off_lattice is None]
+        on_lattice = [one for one in vehicles.values() if one.has_cell]
         staying = [one for one in on_lattice if self._keeps_cells(one)]
         for column, lane in sorted(certain):
             s_m = lattice.cell_s_m(column, t_s)

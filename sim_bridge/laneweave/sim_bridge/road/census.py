@@ -120,7 +120,7 @@ class CensusPublisher:
         vehicles = tuple(on_road)
         off_lattice = self._off_lattice({vehicle.name: vehicle for vehicle in vehicles})
         # A formation without members on the lattice counts as deserted; others may have joined it.
-        present = {one.formation for one in vehicles if one.controller.off_lattice is None}
+        present = {one.formation for one in vehicles if one.has_cell}
         self._closed = [closed for closed in self._closed if closed.first_block in present]
         return Census(
             t_s=t_s,

@@ -126,13 +126,8 @@ class Obstacles:
         return bool(self._pending or self.active or self.passing or self._clearing)
 
     @property
-    def closed(self) -> tuple[TemporaryClosure, ...]:
-        """The parts of lanes that are closed now."""
-        return tuple(one.part for one in self.active)
-
-    @property
     def parts(self) -> tuple[Obstacle, ...]:
-        """The same, as they are published."""
+        """The parts of lanes that are closed now, as they are published."""
         return tuple(one.message for one in self.active)
 
     @property
@@ -348,7 +343,7 @@ class Obstacles:
             if breakdown.vehicle in (None, vehicle.name)
             and breakdown.lane in (None, vehicle.cell[1])
             and (breakdown.at_m is None or vehicle.state[0] >= breakdown.at_m)
-            and vehicle.controller.off_lattice is None
+            and vehicle.has_cell
             and vehicle.controller.broken_mps2 is None
             and vehicle.controller.has_settled(t_s)
             and self._may_stand(vehicle, breakdown.decel_mps2)

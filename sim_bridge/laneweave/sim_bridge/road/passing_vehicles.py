@@ -60,12 +60,14 @@ class PassingVehicle:
     since_s: float
     s_m: float
     """Position of its front."""
+    y_m: float
+    width_m: float
     speed_mps: float
     accel_mps2: float = 0.0
     lowest_mps: float = Factory(lambda self: self.speed_mps, takes_self=True)
     """Lowest speed so far."""
     cleared: Cleared | None = None
-    """What is cleared for it."""
+    """The part of its lane that is cleared for it."""
     closed: TemporaryClosure | None = None
     """The part of its lane that is closed around it."""
     blocked: bool = False
@@ -78,13 +80,13 @@ class PassingVehicle:
 
     @property
     def state(self) -> State:
-        """(s [m], v [m/s], a [m/s2], y [m], v_y [m/s], a_y [m/s2]); y is not known here."""
-        return (self.s_m, self.speed_mps, self.accel_mps2, 0.0, 0.0, 0.0)
+        """(s [m], v [m/s], a [m/s2], y [m], v_y [m/s], a_y [m/s2])."""
+        return (self.s_m, self.speed_mps, self.accel_mps2, self.y_m, 0.0, 0.0)
 
     @property
     def size(self) -> Size:
-        """Length of the vehicle [m]; its width is not known here."""
-        return (self.length_m, 0.0)
+        """Length and width [m]."""
+        return (self.length_m, self.width_m)
 
     @property
     def lanes_used(self) -> set[int]:
@@ -93,12 +95,12 @@ class PassingVehicle:
 
     @property
     def has_cell(self) -> bool:
-        """It has none, but does not wait either."""
+        """Whether it waits for no cell: it never does."""
         return True
 
     @property
     def waits(self) -> bool:
-        """It does not wait for a lane to be open again."""
+        """Whether it waits for a lane to be open again: it never does."""
         return False
 
     @property
@@ -165,24 +167,12 @@ class PassingVehicles:
     @property
     def states(self) -> dict[str, State]:
         """State of each vehicle: (s, v, a, y, v_y, a_y)."""
-        lattice = self._scenario.lattice
-        return {
-            one.name: (
-                one.s_m,
-                one.speed_mps,
-                one.accel_mps2,
-                lattice.cell_y_m(one.passage.lane),
-                0.0,
-                0.0,
-            )
-            for one in self.on_road
-        }
+        return {one.name: one.state for one in self.on_road}
 
     @property
     def sizes(self) -> dict[str, Size]:
         """Length and width of each vehicle [m]."""
-        width_m = self._scenario.vehicle.width_m
-        return {one.name: (one.length_m, width_m) for one in self.on_road}
+        return {one.name: one.size for one in self.on_road}
 
     def is_fast(self, passage: RoadEvent) -> bool:
         """Return whether a vehicle comes from behind: it is at least as fast as the lattice."""
@@ -207,7 +197,13 @@ class PassingVehicles:
                 self._announced.pop(id(passage), None)
                 self._count += 1
                 entered = PassingVehicle(
-                    Name(f"other-{self._count}"), passage, t_s, passage.to_m, passage.speed_mps
+                    Name(f"other-{self._count}"),
+                    passage,
+                    since_s=t_s,
+                    s_m=passage.to_m,
+                    y_m=self._scenario.lattice.cell_y_m(passage.lane),
+                    width_m=self._scenario.vehicle.width_m,
+                    speed_mps=passage.speed_mps,
                 )
                 self.on_road.append(entered)
                 self._changes.append((PART_CLOSED, entered.recorded))
@@ -239,10 +235,9 @@ class PassingVehicles:
             return
         bodies = [
             (lane, one.state[0], one.state[0] - one.size[0], one.state[1])
-            for one in vehicles
+            for one in (*vehicles, *self.on_road)
             for lane in one.lanes_used
         ]
-        bodies += [(one.passage.lane, one.s_m, one.rear_m, one.speed_mps) for one in self.on_road]
         bodies += [(part.lane, part.to_m, part.from_m, 0.0) for part in closed]
         for one in self.on_road:
             ahead = [

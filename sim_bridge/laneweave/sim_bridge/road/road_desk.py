@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping
 import structlog
 from attrs import define, field
 
-from laneweave.protocol.config.road_checks import check_part
+from laneweave.protocol.config.road_checks import check_event
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.road_layout import TemporaryClosure
 from laneweave.protocol.runtime.node import QueryArrived, Reply
@@ -123,20 +123,7 @@ class RoadDesk:
         """
         if self._scenario.sumo.config:
             raise BadInputError("action", request.action, "none in a corridor of a SUMO simulation")
-        lanes = self._scenario.road.lanes
-        if request.lane >= lanes:
-            raise BadInputError("lane", request.lane, f"a lane from 0 to {lanes - 1}")
-        if request.to_m <= request.from_m:
-            raise BadInputError("to_m", request.to_m, f"more than from_m, {request.from_m:g}")
-        check_part(self._scenario, "", request.lane, request.from_m, request.to_m)
-        parts = [(one.part, one.kind) for one in self._obstacles.active]
-        parts += [(one.part, "to be closed") for one in self._waiting]
-        for part, kind in parts:
-            if _overlaps(part, request):
-                where = f"{part.from_m:g} to {part.to_m:g} m"
-                text = f"a part that is open: lane {part.lane} is not, {where} ({kind})"
-                raise BadInputError("from_m", request.from_m, text)
-        return RoadEvent(
+        event = RoadEvent(
             lane=request.lane,
             from_m=request.from_m,
             to_m=request.to_m,
@@ -144,6 +131,15 @@ class RoadDesk:
             for_s=request.for_s,
             clear_s=request.clear_s,
         )
+        check_event(self._scenario, "", event)
+        parts = [(one.part, one.kind) for one in self._obstacles.active]
+        parts += [(one.part, "to be closed") for one in self._waiting]
+        for part, kind in parts:
+            if _overlaps(part, request):
+                where = f"{part.from_m:g} to {part.to_m:g} m"
+                text = f"a part that is open: lane {part.lane} is not, {where} ({kind})"
+                raise BadInputError("from_m", request.from_m, text)
+        return event
 
     def _answer(
         self, waiting: _Waiting, vehicles: Mapping[Name, RoadVehicle], t_s: float

@@ -75,7 +75,7 @@ class EntranceRoom:
             length_m, width_m = vehicle.size
             first, last = lattice.lanes_touched(y_m, width_m)
             goal = vehicle.cell[1]
-            waits = vehicle.controller.off_lattice is not None
+            waits = not vehicle.has_cell
             for number, lane, at_m, merging_m in self._points:
                 beyond_m = s_m - at_m
                 if number in full or beyond_m < 0.0:

@@ -63,8 +63,7 @@ class VehiclesInPart:
             texts.append(f"{inside} {_vehicles(inside)} in it ({_some(self.inside)})")
         if near:
             also = "more " if inside else ""
-            verb = "cannot stop before it"
-            texts.append(f"{near} {also}{verb} ({_some(self.near)})")
+            texts.append(f"{near} {also}cannot stop before it ({_some(self.near)})")
         return " and ".join(texts)
 
 

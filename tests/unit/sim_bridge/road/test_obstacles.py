@@ -143,7 +143,7 @@ def test_others_stop_at_the_line_or_behind_it_and_never_touch_the_vehicle() -> N
     road = lonely_road(BREAKS_DOWN, volume=1500.0)
     while road.t_s < AT_S + STANDS_S:
         road.step()
-    (part,) = road.roadside.obstacles.closed
+    (part,) = road.roadside.obstacles.temporary.closed
     line_m = next(iter(road.roadside.lane_ends)).line_m
     assert line_m == part.from_m - part.late_m - re_entry(ROAD).room_m
     standing = sorted(

@@ -31,7 +31,7 @@ FAST = RoadEvent(1, 0.0, 8.0, 20.0, speed_mps=25.0)
 
 
 def passing(event: RoadEvent, speed_mps: float) -> PassingVehicle:
-    return PassingVehicle(Name("other-1"), event, 0.0, event.to_m, speed_mps)
+    return PassingVehicle(Name("other-1"), event, 0.0, event.to_m, 5.25, 1.8, speed_mps)
 
 
 def lonely_road(*events: RoadEvent, volume: float = 800.0, seed: int = 1) -> LonelyRoad:

@@ -224,7 +224,7 @@ class LightRoad:
     def on_left(self, vehicle: RecordedVehicle, t_s: float, *, attended: bool) -> None:
         """Let a vehicle leave the road."""
         del attended
-        if self.vehicles[Name(vehicle.name)].controller.off_lattice is None:
+        if self.vehicles[Name(vehicle.name)].has_cell:
             self._checker.leave(self.began_s + t_s, vehicle.name)
 
     def on_refused(self, t_s: float, vehicle: Name, refusal: Refusal) -> None:
@@ -263,7 +263,7 @@ class LightRoad:
 
     def _report_stored(self, now_s: float, vehicle: LightVehicle) -> None:
         """Report the record of a vehicle on the lattice."""
-        if vehicle.controller.off_lattice is None:
+        if vehicle.has_cell:
             self._checker.store(now_s, vehicle.name, vehicle.controller.record)
 
     @property
@@ -285,9 +285,7 @@ class LightRoad:
     def _check_parts(self, now_s: float) -> None:
         """Report vehicles with cells in closed parts, or beside a vehicle of another system."""
         obstacles = self._roadside.obstacles
-        on_lattice = [
-            vehicle for vehicle in self.vehicles.values() if vehicle.controller.off_lattice is None
-        ]
+        on_lattice = [vehicle for vehicle in self.vehicles.values() if vehicle.has_cell]
         for one in obstacles.active:
             if one.is_over(self.t_s):
                 continue  # those that have waited start there
@@ -333,7 +331,7 @@ class LightRoad:
         return {
             vehicle.name
             for vehicle in self.vehicles.values()
-            if vehicle.controller.off_lattice is not None
+            if not vehicle.has_cell
             or from_m - 2.0 * stopping_m(self._scenario.lattice.speed_mps) < vehicle.state[0]
         }
 
