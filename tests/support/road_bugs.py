@@ -11,7 +11,7 @@ from msgspec.structs import replace
 
 from laneweave.agents.core import AgentCore
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.road_layout import Exits, TemporaryClosure
+from laneweave.protocol.road_layout import Exits, LanePosition, TemporaryClosure
 from laneweave.protocol.scenario.vehicle_types import VehicleTypes
 from laneweave.protocol.vehicle.lane_end import LaneEnd, ReEntry
 from laneweave.protocol.vehicle.lane_ends import LaneEnds
@@ -264,6 +264,27 @@ def entrances_stay_open(*_: object) -> None:
 @breaks(OBSTACLES, RoadVehicle, "close")
 def controllers_do_not_know(*_: object) -> None:
     """Motion controllers do not learn which parts are closed."""
+
+
+@breaks(OBSTACLES, LaneEndControl, "_may_take")
+def gaps_are_taken_whatever_is_closed(*_: object) -> bool:
+    """Vehicles start into gaps in lanes that have been closed meanwhile, or beyond the line."""
+    return True
+
+
+@breaks(OBSTACLES, LaneEndControl, "_opens")
+def vehicles_start_before_the_next_dead_end(
+    _opens: Call, self: LaneEndControl, at: LanePosition, _vehicle: RoadVehicle
+) -> bool:
+    """A vehicle starts in its own lane although another part of it is closed ahead."""
+    return at in self.over
+
+
+@breaks(OBSTACLES)
+def parts_are_closed_before_vehicles_that_start(patch: Patch) -> None:
+    """A part is closed although a vehicle has started that heeds no closed part there."""
+    patch.setattr(RoadVehicle, "starts", False)
+    patch.setattr(RoadVehicle, "passes_m", property(lambda self: self.state[0]))
 
 
 @breaks(OBSTACLES, LaneEnds, "enters_cleared")

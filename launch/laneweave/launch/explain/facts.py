@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any
 
 from attrs import define, field
@@ -66,6 +66,21 @@ class Absence:
 
 
 @define
+class ClosedPart:
+    """A part of a lane that was closed for a time, or a vehicle of another system there."""
+
+    first: Event
+    """The event `part-closed` with which it began."""
+    newest: Event
+    """The newest one, which may know better where the part ends."""
+    until_s: float = math.inf
+
+    def meets(self, since_s: float, until_s: float) -> bool:
+        """Return whether it was closed at some time from one road time to another."""
+        return float(self.first["t_s"]) <= until_s and since_s <= self.until_s
+
+
+@define
 class Facts:
     """Facts about a vehicle, up to its departure or the end of the recording."""
 
@@ -120,6 +135,8 @@ class Facts:
     """The last time without an agent of every vehicle that has had one."""
     never_attended: bool = False
     """Whether its agent did not start in time."""
+    closed_parts: list[ClosedPart] = field(factory=list)
+    """Those that had begun when the facts end."""
     refused: list[Event] = field(factory=list)
     """Processes whose settings were refused."""
     leader_gaps: list[tuple[float, float]] = field(factory=list)
@@ -128,6 +145,35 @@ class Facts:
     """The newest event `leader`."""
     end_s: float = 0.0
     """Time of the last event of the run up to its departure."""
+
+    @property
+    def breakdown(self) -> ClosedPart | None:
+        """Its own breakdown, if it has had one: the newest."""
+        own = (one for one in self.closed_parts if one.first["vehicle"] == self.vehicle)
+        return max(own, key=lambda one: float(one.first["t_s"]), default=None)
+
+    def closed_between(self, since_s: float, until_s: float) -> list[ClosedPart]:
+        """Return the parts that were closed in lanes that it had or wanted, in some time."""
+        lanes = [
+            int(event[key])
+            for event in (self.entered, self.left)
+            if event is not None
+            for key in ("lane", "preferred_lane")
+            if key in event
+        ]
+        return [
+            one
+            for one in self.closed_parts
+            if lanes
+            and min(lanes) <= one.first["lane"] <= max(lanes)
+            and one.meets(since_s, until_s)
+        ]
+
+    def stopped_before(self, event: Event) -> ClosedPart | None:
+        """Return the closed part before which it stopped, with its event `left-lattice`."""
+        t_s = float(event["t_s"])
+        parts = (one for one in self.closed_parts if one.first["lane"] == event["lane"])
+        return next((one for one in parts if one.meets(t_s, t_s)), None)
 
     @property
     def absence(self) -> Absence | None:
@@ -195,13 +241,11 @@ def _add(facts: Facts, event: Event) -> None:
         facts.out_of_reach = event
     elif kind == kinds.RUN_ENDED:
         facts.run_ended = event
-    elif kind == kinds.LEADER:
-        _add_leader(facts, event)
     elif kind == kinds.SETTINGS_REFUSED:
         facts.events.append(event)
         facts.refused.append(event)
-    elif kind in (kinds.STREAM_PLANNED, kinds.PLANNING_FAILED, kinds.PLANNING_LATE):
-        _add_slot(facts, event)
+    elif kind in _OF_ROAD:
+        _OF_ROAD[kind](facts, event)
     elif _is_around(facts.vehicle, event):
         _add_around(facts, event)
 
@@ -224,10 +268,34 @@ def _is_around(vehicle: str, event: Event) -> bool:
     return kind in _OF_SEVERAL and vehicle in event[_OF_SEVERAL[kind]]
 
 
+def _add_part(facts: Facts, event: Event) -> None:
+    at = _part_of(event)
+    active = (one for one in facts.closed_parts if math.isinf(one.until_s))
+    known = next((one for one in active if _part_of(one.first) == at), None)
+    if event["kind"] == kinds.PART_OPENED:
+        if known is None:
+            return
+        known.until_s = float(event["t_s"])
+    elif known is not None:
+        known.newest = event
+        return
+    else:
+        facts.closed_parts.append(ClosedPart(event, event))
+    if facts.entered is not None:
+        facts.events.append(event)
+
+
+def _part_of(event: Event) -> tuple[object, ...]:
+    """Return what identifies a part while it is closed."""
+    return event["lane"], event["cause"], event["vehicle"], event["from_m"]
+
+
 def _add_own(facts: Facts, event: Event) -> None:
     match event["kind"]:
         case kinds.ENTERED:
             facts.entered = event
+            active = (one for one in facts.closed_parts if math.isinf(one.until_s))
+            facts.events += [one.first for one in active]
         case kinds.LEFT:
             facts.left = event
         case kinds.LEFT_OFF_LANE:
@@ -332,6 +400,17 @@ def _add_leader(facts: Facts, event: Event) -> None:
         until_s = event["leader_until_s"]
         if until_s is None or t_s > until_s + facts.leaderless_after_s:
             facts.leader_gaps.append((until_s or 0.0, t_s))
+
+
+_OF_ROAD: Mapping[str, Callable[[Facts, Event], None]] = {
+    kinds.LEADER: _add_leader,
+    kinds.PART_CLOSED: _add_part,
+    kinds.PART_OPENED: _add_part,
+    kinds.STREAM_PLANNED: _add_slot,
+    kinds.PLANNING_FAILED: _add_slot,
+    kinds.PLANNING_LATE: _add_slot,
+}
+"""What adds the events that concern all vehicles, by kind."""
 
 
 def _add_end(facts: Facts) -> None:

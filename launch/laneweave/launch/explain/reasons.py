@@ -13,7 +13,7 @@ from enum import StrEnum
 from attrs import frozen
 
 from laneweave.launch.explain.facts import Absence, Facts
-from laneweave.launch.explain.story import ABSENCE, names, seconds
+from laneweave.launch.explain.story import ABSENCE, closed_part, names, seconds
 from laneweave.protocol.wire import events as kinds
 from laneweave.protocol.wire import reasons
 
@@ -55,6 +55,10 @@ class Reason(StrEnum):
     """It began its move into or out of an exit lane too late."""
     STOPPED = "stopped-at-lane-end"
     """It stopped before the end of its lane."""
+    BROKE_DOWN = "broke-down"
+    """It had broken down itself."""
+    CLOSED_PART = "closed-part"
+    """A part of a lane was closed for a time, or a vehicle of another system was there."""
     METHOD = "method"
     """A reference method drove it, which makes no plans."""
 
@@ -76,18 +80,26 @@ _OF_ABSENCE: Mapping[str, Reason] = {
 
 def reason_of(facts: Facts) -> Finding:
     """Return why a vehicle that has left the road missed its lane."""
+    breakdown = facts.breakdown
+    if breakdown is not None:
+        first = breakdown.first
+        text = f"it broke down at {seconds(first['t_s'])}, in lane {first['lane']}"
+        return Finding(Reason.BROKE_DOWN, text)
     cause = _cause(facts)
     end = facts.lane_end
     if end is None:
         return cause
     at = f"at {seconds(end['t_s'])}"
+    part = facts.stopped_before(end)
     if end["kind"] == kinds.MISSED_EXIT:
         text = f"it began its move to or from the exit lane too late {at}, in lane {end['lane']}"
         reason = Reason.MISSED_EXIT
+    elif part is not None:
+        text, reason = f"it stopped {at} before {closed_part(part)}", Reason.CLOSED_PART
     else:
         text = f"it stopped before the end of lane {end['lane']} {at}"
         reason = Reason.STOPPED
-    known = cause.reason not in (Reason.NOT_COMPLETED, Reason.NO_PLAN)
+    known = cause.reason not in (Reason.NOT_COMPLETED, Reason.NO_PLAN, reason)
     return Finding(reason, f"{text}: {cause.text}" if known else text)
 
 
@@ -101,6 +113,7 @@ def _cause(facts: Facts) -> Finding:
         or _own_agent(facts)
         or (_unplanned(facts) if facts.in_force_s is None and not facts.rolling else None)
         or _stalled(facts)
+        or _closed(facts)
     )
     return found or Finding(Reason.NOT_COMPLETED, "it had a plan, but has not completed it")
 
@@ -161,7 +174,22 @@ def _unreached(facts: Facts) -> Finding | None:
         by = _with_absences(facts, facts.without_agent)
         text = f"{planned} did not reach its lane; without agents, and perhaps on its way: {by}"
         return Finding(Reason.BLOCKED, text)
-    return Finding(Reason.NO_ROOM, f"{planned} had no path to its lane")
+    no_path = f"{planned} had no path to its lane"
+    parts = facts.closed_between(event["t_s"], event["t_s"])
+    if parts:
+        return Finding(Reason.CLOSED_PART, f"{no_path} because of {closed_part(parts[-1])}")
+    return Finding(Reason.NO_ROOM, no_path)
+
+
+def _closed(facts: Facts) -> Finding | None:
+    """Return the reason if nothing but closed parts kept a plan from being completed."""
+    if facts.entered is None:
+        return None
+    parts = facts.closed_between(facts.entered["t_s"], facts.end_s)
+    if not parts:
+        return None
+    text = f"it had a plan, but has not completed it because of {closed_part(parts[-1])}"
+    return Finding(Reason.CLOSED_PART, text)
 
 
 def _too_late(facts: Facts) -> Finding | None:

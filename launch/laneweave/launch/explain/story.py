@@ -8,10 +8,11 @@ from typing import Any
 
 from attrs import frozen
 
-from laneweave.launch.explain.facts import LEADER_LOST, Event, Facts
+from laneweave.launch.explain.facts import LEADER_LOST, ClosedPart, Event, Facts
 from laneweave.protocol.names import first_names
 from laneweave.protocol.road_layout import ANY_LANE, END_OF_ROAD
 from laneweave.protocol.wire import events as kinds
+from laneweave.protocol.wire import obstacle_messages
 
 MAX_NAMES = 6
 """Maximum number of vehicles that a line names."""
@@ -61,6 +62,10 @@ def _lines(facts: Facts) -> Iterator[StoryLine]:
         events = list(group)
         if kind in _CHARGE and events[0]["vehicle"] != facts.vehicle:
             text = _of_others(kind, events)
+        elif kind == kinds.LEFT_LATTICE:
+            text = _stops(facts, events[0])
+        elif kind == kinds.PART_CLOSED and events[0]["vehicle"] == facts.vehicle:
+            text = f"breaks down in lane {events[0]['lane']}"
         else:
             text = _TEXTS[kind](events[0]) if kind in _TEXTS else ""
         if text:
@@ -129,6 +134,49 @@ def _fault(event: Event) -> str:
     return f"fault injected ({event['fault']}): {event['target']} {event['action']}"
 
 
+def _stops(facts: Facts, event: Event) -> str:
+    part = facts.stopped_before(event)
+    if part is None:
+        return f"stops before the end of lane {event['lane']}"
+    if part.first["vehicle"] == facts.vehicle:
+        return ""  # it is the part
+    return f"stops before {closed_part(part)}"
+
+
+def closed_part(part: ClosedPart) -> str:
+    """Return a part of a lane that was closed, and why, as a noun."""
+    event = part.newest
+    lane, vehicle = event["lane"], event["vehicle"]
+    if event["cause"] == obstacle_messages.PASSING:
+        return f"{vehicle}, a vehicle of another system, in lane {lane}"
+    where = f"lane {lane}, closed from {event['from_m']:.0f} to {event['to_m']:.0f} m"
+    return (
+        f"{where} ({vehicle} had broken down)"
+        if event["cause"] == obstacle_messages.BREAKDOWN
+        else where
+    )
+
+
+def _part_closed(event: Event) -> str:
+    lane, vehicle = event["lane"], event["vehicle"]
+    match event["cause"]:
+        case obstacle_messages.PASSING:
+            speed = f"at {event['speed_mps']:.1f} m/s"
+            return f"{vehicle}, a vehicle of another system, enters lane {lane} {speed}"
+        case obstacle_messages.BREAKDOWN:
+            return (
+                f"{vehicle} breaks down in lane {lane}, which is closed at {event['from_m']:.0f} m"
+            )
+        case _:
+            return f"lane {lane} closed from {event['from_m']:.0f} to {event['to_m']:.0f} m"
+
+
+def _part_opened(event: Event) -> str:
+    if event["cause"] == obstacle_messages.PASSING:
+        return f"{event['vehicle']} has left lane {event['lane']}"
+    return f"lane {event['lane']} open again from {event['from_m']:.0f} m on"
+
+
 def _caretaker(event: Event) -> str:
     return f"caretaker in charge: {ABSENCE[event['reason']]}"
 
@@ -169,9 +217,10 @@ _TEXTS: Mapping[str, Callable[[Event], str]] = {
     kinds.AGENT_TOOK_OVER: lambda event: f"agent in charge, after the {event['previous']}",
     kinds.COMMAND_REFUSED: lambda event: f"command refused: {event['reason']}",
     kinds.OVERLAP: lambda event: f"bodies overlap: {' and '.join(event['vehicles'])}",
-    kinds.LEFT_LATTICE: lambda event: f"stops before the end of lane {event['lane']}",
     kinds.MISSED_EXIT: lambda event: f"missed its exit; stays in lane {event['lane']}",
     kinds.DRIVES_OUT: lambda event: f"drives into a gap in lane {event['lane']}",
+    kinds.PART_CLOSED: _part_closed,
+    kinds.PART_OPENED: _part_opened,
     kinds.ENTERED_LATTICE: lambda event: f"has a cell again, in lane {event['lane']}",
 }
 """Text of an event, by kind; `left-off-lane` repeats `left`."""

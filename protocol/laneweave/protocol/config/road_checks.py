@@ -30,6 +30,7 @@ from laneweave.protocol.vehicle.lane_ends import (
     first_step_m,
     lane_beside,
     re_entry,
+    sections_to_lines,
 )
 from laneweave.protocol.vehicle.sudden_stops import begins_m, room_before_part_m
 from laneweave.protocol.wire.messages import CAR
@@ -335,6 +336,7 @@ def check_dead_ends(scenario: Scenario) -> None:
         weakest = min(limits, key=lambda name: limits[name])
         name = limit_name(scenario, weakest, "max_accel_mps2")
         raise BadInputError(name, limits[weakest], f"more: {error}") from error
+    sections = sections_to_lines(scenario)
     for end in dead_ends(scenario):
         name = next(
             f"road.closures[{number}].from_m"
@@ -348,7 +350,7 @@ def check_dead_ends(scenario: Scenario) -> None:
             f"{needed.room_m:g} m for driving on after stopping at the end of the lane",
         )
         require(
-            end.taken_back or lane_beside(scenario, end) is not None,
+            end.taken_back or lane_beside(scenario, end.lane, end.line_m, sections) is not None,
             name,
             end.end_m,
             f"the end of a lane beside one that is open from {end.line_m:g} m, its stop line, to "

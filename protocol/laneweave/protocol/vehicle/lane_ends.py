@@ -351,26 +351,31 @@ def _end_ahead(by_lane: Sequence[Sequence[LaneEnd]], lane: int, s_m: float) -> L
 
 
 def lane_beside(
-    scenario: Scenario, end: LaneEnd, closed: Sequence[TemporaryClosure] = ()
+    scenario: Scenario, lane: int, at_m: float, sections: Iterable[LaneSection]
 ) -> int | None:
-    """Return the lane into which vehicles re-enter at a dead end; None: there is none.
+    """Return the lane into which a vehicle re-enters; None: there is none.
 
-    It is open from before the stop line until a vehicle that re-enters has arrived in its cell, and
-    the first vehicles enter it before the line: there, its cells can be kept free.
+    It is open from before the vehicle until that has arrived in its cell, and the first vehicles
+    enter it before that position: there, its cells can be kept free.
+
+    Args:
+        scenario: lattice and road.
+        lane: lane in which the vehicle waits.
+        at_m: position of its front.
+        sections: those of the road, up to the stop lines in them; see `sections_to_lines`.
     """
     needed = re_entry(scenario)
     pitch_m = scenario.lattice.pitch_m
-    sections = sections_to_lines(scenario, closed)
-    from_m = end.line_m - needed.columns * pitch_m - scenario.types.longest_body_m
-    to_m = min(end.line_m + needed.distance_m, scenario.road.length_m)
+    from_m = at_m - needed.columns * pitch_m - scenario.types.longest_body_m
+    to_m = min(at_m + needed.distance_m, scenario.road.length_m)
     entry_m = dict(enumerate(scenario.geometry.entry_m))
-    for lane in (end.lane + 1, end.lane - 1):
-        if entry_m.get(lane, math.inf) > end.line_m:
+    for beside in (lane + 1, lane - 1):
+        if entry_m.get(beside, math.inf) > at_m:
             continue
         for section in sections:
             begins_m = max(section.from_m, section.moves_from_m)
-            if section.lane == lane and begins_m <= from_m and to_m <= section.to_m:
-                return lane
+            if section.lane == beside and begins_m <= from_m and to_m <= section.to_m:
+                return beside
     return None
 
 

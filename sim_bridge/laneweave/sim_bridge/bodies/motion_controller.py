@@ -70,6 +70,8 @@ from laneweave.sim_bridge.bodies.plant import Plant
 from laneweave.sim_bridge.bodies.record_store import RecordStore
 from laneweave.sim_bridge.bodies.stop_lines import STANDING_MPS, StopLinesAhead
 
+PARKED_MPS = 0.05
+"""Speed below which a brake holds a vehicle that is to stand, whatever is measured."""
 SLOWED_MPS = 2.0
 """Loss of speed from which a body does not enter another lane."""
 RELEASE_M = 1.0
@@ -195,8 +197,12 @@ class MotionController:
         """
         if self.off_lattice is OffLatticePhase.WAITING or not self.stop_lines.lane_ends:
             return False
-        if self.off_lattice is OffLatticePhase.RE_ENTERING and self.stop_lines.passed:
-            return False
+        ends, starts = self.stop_lines.lane_ends, self.off_lattice is OffLatticePhase.RE_ENTERING
+        if starts and self.stop_lines.passed:
+            # Unless a part of the other lane is closed meanwhile, so that it has to stand.
+            cell, (s_m, speed_mps, *_) = self.hold_cell, self.measured
+            body_m = self.stop_lines.section_m(cell[1], s_m)
+            return speed_mps < STANDING_MPS and ends.has_passed(cell, t_s, body_m=body_m)
         stays_free = self.store.territory.given_up_cells_stay_free
         first, last = self.lattice.lanes_touched(self.measured[3], self._limits.width_m)
         if not stays_free and first != last and self.measured[1] > STANDING_MPS:
@@ -204,7 +210,7 @@ class MotionController:
         # Behind an exit the lane may belong to a ramp, to whose end the body does not come.
         cell = self.hold_cell[0], self._body_lane
         body_m = self.stop_lines.section_m(cell[1], self.measured[0])
-        return self.stop_lines.lane_ends.has_passed(cell, t_s, body_m=body_m)
+        return ends.has_passed(cell, t_s, body_m=body_m)
 
     @property
     def keeps_lane(self) -> bool:
@@ -393,6 +399,8 @@ class MotionController:
             level = FallbackLevel.EMERGENCY
             # The body leaves its trajectory.
             self._jerks = self._jerks[:0]
+            plant.brake(jerk[1])
+        elif (self.stays or self.broken_mps2 is not None) and plant.state[1] < PARKED_MPS:
             plant.brake(jerk[1])
         else:
             plant.step(*jerk)

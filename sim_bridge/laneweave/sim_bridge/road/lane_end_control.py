@@ -18,7 +18,12 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from attrs import define, frozen
 
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.road_layout import ClearedPart, LanePosition, TemporaryClosure
+from laneweave.protocol.road_layout import (
+    ClearedPart,
+    LanePosition,
+    LaneSection,
+    TemporaryClosure,
+)
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.lane_end import LaneEnd
 from laneweave.protocol.vehicle.lane_ends import (
@@ -28,6 +33,7 @@ from laneweave.protocol.vehicle.lane_ends import (
     lane_beside,
     own_re_entry,
     re_entry,
+    sections_to_lines,
 )
 from laneweave.protocol.vehicle.sudden_stops import queue_pitch_m
 from laneweave.protocol.vehicle.territory import territory_of
@@ -84,11 +90,12 @@ class LaneEndControl:
         self._cleared: tuple[ClearedPart, ...] = ()
         self._ends: dict[LanePosition, LaneEnd] = {}
         """Dead ends by lane and end; those that have vanished as long as vehicles wait there."""
-        self._beside: dict[LanePosition, int | None] = {}
+        self._sections: tuple[LaneSection, ...] = ()
+        """Those of the road, up to the stop lines in them."""
         self._columns, self._distance_m, self._room_m = 0, 0.0, 0.0
         self._gaps: dict[LanePosition, list[Gap]] = {}
         self.over: frozenset[LanePosition] = frozenset()
-        """Ends of which the cause is over: vehicles start from wherever they wait."""
+        """Ends of which the cause is over."""
         self._last_gap_column: dict[int, float] = {}
         """Rearmost column of the last gap, by entry point."""
         self._entered_gaps: list[range] = []
@@ -111,10 +118,7 @@ class LaneEndControl:
             needed = re_entry(scenario)
             self._columns, self._room_m = needed.columns, needed.room_m
             self._distance_m = needed.distance_m
-        self._beside = {
-            at: None if end.taken_back else lane_beside(scenario, end, closed)
-            for at, end in self._ends.items()
-        }
+        self._sections = sections_to_lines(scenario, closed) if self._ends else ()
         before, self._gaps = self._gaps, {at: [] for at in self._ends}
         for at, gaps in before.items():
             merged = self._merged(at)
@@ -164,17 +168,26 @@ class LaneEndControl:
             elif (missed and self._cells_stay_free) or controller.has_lost_cell(t_s):
                 # While it re-enters, a vehicle may come to another dead end.
                 yield self.take_off(name, vehicle)
+            elif controller.off_lattice is OffLatticePhase.WAITING and controller.stays:
+                # Parts that are closed for a time come and go ahead of it.
+                lane, s_m = controller.hold_cell[1], vehicle.state[0]
+                self._end_of[name] = self._end_ahead(lane, s_m) or self._end_of.get(name)
         for at, gaps in self._gaps.items():
             startable = self._startable(at, vehicles)
             if startable:
-                yield from self._start(startable[0], gaps, t_s)
+                usable = [gap for gap in gaps if self._may_take(gap, at, startable[0])]
+                yield from self._start(startable[0], usable, t_s)
                 startable = self._startable(at, vehicles)
             yield from self._arrive(gaps, vehicles, t_s)
             last_m = max([self._ends[at].line_m, *(one.state[0] for one in startable[:1])])
             gaps[:] = [gap for gap in gaps if gap.vehicle or not self._is_over(gap, last_m, t_s)]
-            coming = sum(gap.vehicle is None for gap in gaps)
-            if len(startable) > coming:
-                self._request(at, gaps, t_s)
+            free = [gap for gap in gaps if gap.vehicle is None]
+            for vehicle in startable:
+                own = next((gap for gap in free if self._may_take(gap, at, vehicle)), None)
+                if own is None:
+                    self._request(at, vehicle, gaps, t_s)
+                    break
+                free.remove(own)
 
     def bodies(self, vehicles: Mapping[Name, RoadVehicle]) -> dict[Name, OffLattice]:
         """Return the lane and the rear of each vehicle without cells.
@@ -194,10 +207,10 @@ class LaneEndControl:
                 found[name] = OffLattice(lane, s_m - vehicles[name].size[0])
         return found
 
-    def _request(self, at: LanePosition, gaps: list[Gap], t_s: float) -> None:
-        """Keep the next columns beside an end free, unless the last gap was too close ahead."""
-        over = at in self.over and self._may_pass(self._ends[at])
-        lane = at[0] if over else self._beside[at]
+    def _request(self, at: LanePosition, vehicle: RoadVehicle, gaps: list[Gap], t_s: float) -> None:
+        """Keep the next columns free for a vehicle, unless the last gap was too close ahead."""
+        over = self._opens(at, vehicle)
+        lane = at[0] if over else self._beside(at, vehicle)
         if lane is None:
             return  # SUMO takes the vehicle back
         # Behind the first entry point of the lane, vehicles may own its cells.
@@ -213,25 +226,56 @@ class LaneEndControl:
             self._last_gap_column |= dict.fromkeys(taken, columns[0])
             gaps.append(Gap(lane, columns))
 
-    def _may_pass(self, end: LaneEnd) -> bool:
-        """Return whether a vehicle that starts in its own lane settles before the next dead end."""
-        settles_m = end.reopens_m + self._distance_m
-        later = (other for other in self._ends.values() if other.lane == end.lane)
-        return all(other.line_m >= settles_m for other in later if other.end_m > end.end_m)
+    def _opens(self, at: LanePosition, vehicle: RoadVehicle) -> bool:
+        """Return whether a vehicle starts in its own lane, from where it waits.
+
+        The cause of its dead end is over, or its body is beyond what is closed there, and it
+        settles before the next dead end ahead of its body.
+        """
+        end, s_m = self._ends[at], vehicle.state[0]
+        if at not in self.over and s_m < end.reopens_m:
+            return False
+        settles_m = max(end.reopens_m, s_m) + self._distance_m
+        return all(
+            other.line_m >= settles_m
+            for other in self._ends.values()
+            if other.lane == end.lane and other.end_m > end.end_m and other.reopens_m > s_m
+        )
+
+    def _is_before_line(self, at: LanePosition, vehicle: RoadVehicle) -> bool:
+        """Return whether a vehicle has the room before a dead end to start beside it."""
+        return vehicle.state[0] <= self._ends[at].line_m + NEAR_LINE_M
+
+    def _beside(self, at: LanePosition, vehicle: RoadVehicle) -> int | None:
+        """Return the lane into which a vehicle at a dead end re-enters; None: there is none now."""
+        end, s_m = self._ends[at], vehicle.state[0]
+        opens = self._opens(at, vehicle)
+        if end.taken_back or not (opens or self._is_before_line(at, vehicle)):
+            return None
+        # Before a part that is closed for a time, it starts from where it stands.
+        at_m = s_m if opens else min(s_m, end.line_m) if end.sudden else end.line_m
+        return lane_beside(self._scenario, end.lane, at_m, self._sections)
+
+    def _may_take(self, gap: Gap, at: LanePosition, vehicle: RoadVehicle) -> bool:
+        """Return whether a gap can be for a vehicle, as its lane and the one beside it are now."""
+        if gap.lane == at[0]:
+            return self._opens(at, vehicle)
+        return gap.lane == self._beside(at, vehicle)
 
     def take_off(self, name: Name, vehicle: RoadVehicle) -> LaneEndChange:
         """Take a vehicle off the lattice that has broken down, or whose lane ends."""
         self._forget(name)
         vehicle.controller.leave_lattice()
-        lane, s_m = vehicle.controller.hold_cell[1], vehicle.state[0]
-        ends = [(at, end) for at, end in self._ends.items() if end.lane == lane]
-        # The first that the body has not passed.
-        at, end = next(
-            (each for each in ends if s_m < each[1].reopens_m), ends[-1] if ends else (None, None)
-        )
-        vehicle.controller.stays = end is not None and end.sudden
-        self._end_of[name] = at
+        lane = vehicle.controller.hold_cell[1]
+        at = self._end_of[name] = self._end_ahead(lane, vehicle.state[0])
+        vehicle.controller.stays = at is not None and self._ends[at].sudden
         return LaneEndChange(name, LEFT_LATTICE, lane)
+
+    def _end_ahead(self, lane: int, s_m: float) -> LanePosition | None:
+        """Return the first dead end of a lane that a body has not passed, or else the last one."""
+        ends = [at for at in self._ends if at[0] == lane]
+        ahead = (at for at in ends if s_m < self._ends[at].reopens_m)
+        return next(ahead, ends[-1] if ends else None)
 
     def _startable(
         self, at: LanePosition, vehicles: Mapping[Name, RoadVehicle]
@@ -241,11 +285,10 @@ class LaneEndControl:
         Those beyond the line have no room to start before what is ahead is gone.
         """
         waiting = self._waiting(at, vehicles)
-        if at in self.over:
-            return waiting
-        line_m = self._ends[at].line_m + NEAR_LINE_M
-        startable = [one for one in waiting if one.state[0] <= line_m]
-        beyond = waiting[: len(waiting) - len(startable)]
+        startable = [
+            one for one in waiting if self._opens(at, one) or self._is_before_line(at, one)
+        ]
+        beyond = waiting[: waiting.index(startable[0])] if startable else ()
         if startable and beyond:
             rear_m = beyond[-1].state[0] - beyond[-1].size[0]
             return startable if rear_m - startable[0].state[0] >= self._room_m else []
@@ -273,7 +316,7 @@ class LaneEndControl:
         for gap in gaps:
             if any(
                 part.lane == gap.lane
-                and part.speed_mps > 0.0  # at rest, it may wait for this vehicle
+                and part.speed_mps > STANDING_MPS  # at rest, it may wait for this vehicle
                 and part.at(t_s)[0] < s_m + self._distance_m
                 and part.at(t_s + settles_s)[1] > s_m - vehicle.size[0]
                 for part in self._cleared

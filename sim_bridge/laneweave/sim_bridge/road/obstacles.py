@@ -83,6 +83,7 @@ class ActiveObstacle:
     until_s: float = math.inf
     """When the cause is over; infinite: not known."""
     breakdown: Breakdown | None = None
+    """What keeps its vehicle from driving, as long as it does."""
     event: RoadEvent | None = None
     """The cause of a part that is closed without a vehicle."""
     vehicle: Name | None = None
@@ -195,7 +196,7 @@ class Obstacles:
             self._follow(one, vehicles, t_s)
             if one.is_over(t_s) and one.begins_at not in in_use:
                 self.active.remove(one)
-        self.passing.update(vehicles, t_s)
+        self.passing.update(vehicles, self.without_vehicles(t_s), t_s)
         self._follow_passing(vehicles, t_s)
         self._clearing = []
         for cause in [one for one in self._pending if t_s >= one.at_s]:
@@ -268,13 +269,16 @@ class Obstacles:
     def _follow(
         self, one: ActiveObstacle, vehicles: Mapping[Name, RoadVehicle], t_s: float
     ) -> None:
-        """Note that a vehicle that breaks down has stopped, or has left the road."""
-        if one.breakdown is None or one.vehicle is None or one.stands:
+        """Note that a vehicle that breaks down has stopped, is repaired, or has left the road."""
+        if one.breakdown is None or one.vehicle is None:
             return
         vehicle = vehicles.get(one.vehicle)
         if vehicle is None:
-            one.until_s = t_s
-        elif vehicle.state[1] < STANDING_MPS:
+            one.until_s = min(one.until_s, t_s)
+        elif one.is_over(t_s):
+            # From now on it waits, and does not keep vehicles behind it from driving.
+            one.breakdown, vehicle.controller.broken_mps2 = None, None
+        elif not one.stands and vehicle.state[1] < STANDING_MPS:
             one.stands, one.until_s = True, t_s + one.breakdown.for_s
             to_m = self._end_m(one.part.lane, vehicle.state[0])
             one.part = one.part._replace(to_m=to_m)

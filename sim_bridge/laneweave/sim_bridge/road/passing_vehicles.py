@@ -9,7 +9,7 @@ brakes for what is ahead of it.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 
 from attrs import Factory, define, field
 
@@ -94,6 +94,11 @@ class PassingVehicle:
         return {self.passage.lane}
 
     @property
+    def stops_m(self) -> float:
+        """Where it can stop if it has not expected to."""
+        return self.s_m + MIN_GAP_M + self.speed_mps**2 / (2.0 * HARDEST_MPS2) + self.speed_mps
+
+    @property
     def has_cell(self) -> bool:
         """Whether it waits for no cell: it never does."""
         return True
@@ -102,6 +107,16 @@ class PassingVehicle:
     def waits(self) -> bool:
         """Whether it waits for a lane to be open again: it never does."""
         return False
+
+    @property
+    def starts(self) -> bool:
+        """Whether it is on its way into a cell: it never is."""
+        return False
+
+    @property
+    def passes_m(self) -> float:
+        """Position up to which it heeds no closed part: its front."""
+        return self.s_m
 
     @property
     def rear_m(self) -> float:
@@ -178,8 +193,19 @@ class PassingVehicles:
         """Return whether a vehicle comes from behind: it is at least as fast as the lattice."""
         return passage.speed_mps >= self._scenario.lattice.speed_mps
 
-    def update(self, vehicles: Mapping[Name, BodyOnRoad], t_s: float) -> None:
-        """Let vehicles enter and leave, and update what is closed and cleared for them."""
+    def update(
+        self,
+        vehicles: Mapping[Name, BodyOnRoad],
+        closed: Collection[TemporaryClosure],
+        t_s: float,
+    ) -> None:
+        """Let vehicles enter and leave, and update what is closed and cleared for them.
+
+        Args:
+            vehicles: those of this system.
+            closed: parts in which no vehicle may be.
+            t_s: road time.
+        """
         end_m = self._scenario.road.length_m
         for one in list(self.on_road):
             if one.s_m >= end_m or t_s >= one.passage.ends_s(one.since_s):
@@ -192,7 +218,7 @@ class PassingVehicles:
                 continue
             if id(passage) not in self._announced:
                 self._announced[id(passage)] = self._cleared_before(passage, t_s)
-            if self._has_room(passage, vehicles, t_s):
+            if self._has_room(passage, vehicles, closed, t_s):
                 self._pending.remove(passage)
                 self._announced.pop(id(passage), None)
                 self._count += 1
@@ -248,7 +274,11 @@ class PassingVehicles:
             one.step(*min(ahead, default=(math.inf, 0.0)), tick_s)
 
     def _has_room(
-        self, passage: RoadEvent, vehicles: Mapping[Name, BodyOnRoad], t_s: float
+        self,
+        passage: RoadEvent,
+        vehicles: Mapping[Name, BodyOnRoad],
+        closed: Iterable[TemporaryClosure],
+        t_s: float,
     ) -> bool:
         """Return whether a vehicle can enter: nobody has to brake hard for it, nor it for others.
 
@@ -256,32 +286,43 @@ class PassingVehicles:
         """
         lane, from_m, to_m = passage.lane, passage.from_m, passage.to_m
         waits = t_s < passage.at_s + passage.clear_s
-        for one in self.on_road:
-            if one.passage.lane != lane:
-                continue
-            if one.s_m <= from_m:
-                if not _follows(from_m, one.s_m, one.speed_mps, passage.speed_mps):
-                    return False
-            elif one.rear_m < to_m + gap_needed_m(passage.speed_mps, one.speed_mps):
-                return False
-        if not self.is_fast(passage):
+        if not self._has_room_between_others(passage) or any(
+            part.lane == lane
+            and part.to_m > from_m
+            and not _follows(part.from_m, to_m, passage.speed_mps, 0.0)
+            for part in closed
+        ):
+            return False
+        lattice_mps, fast = self._scenario.lattice.speed_mps, self.is_fast(passage)
+        if not fast:
             found = vehicles_in_part(self._scenario, lane, from_m, to_m, vehicles.values())
-            return found.allow_closing(waits=waits)
-        lattice_mps = self._scenario.lattice.speed_mps
-        free_m = to_m + (self._cleared_ahead_m(passage, 2) if waits else 0.0)
+            if not found.allow_closing(waits=waits):
+                return False
+        free_m = to_m + (self._cleared_ahead_m(passage, 2) if waits and fast else 0.0)
         for vehicle in vehicles.values():
             s_m, speed_mps = vehicle.state[:2]
-            if passage.lane not in vehicle.lanes_used:
+            if lane not in vehicle.lanes_used:
                 continue
             rear_m = s_m - vehicle.size[0]
-            if s_m <= passage.from_m:
-                if not _follows(passage.from_m, s_m, speed_mps, passage.speed_mps):
+            if s_m <= from_m:
+                if fast and not _follows(from_m, s_m, speed_mps, passage.speed_mps):
                     return False
             elif rear_m < free_m or not _follows(
-                rear_m, passage.to_m, passage.speed_mps, min(speed_mps, lattice_mps)
+                rear_m, to_m, passage.speed_mps, min(speed_mps, lattice_mps)
             ):
                 return False
         return True
+
+    def _has_room_between_others(self, passage: RoadEvent) -> bool:
+        """Return whether a vehicle can enter before and behind those of other systems."""
+        from_m, to_m = passage.from_m, passage.to_m
+        return all(
+            _follows(from_m, one.s_m, one.speed_mps, passage.speed_mps)
+            if one.s_m <= from_m
+            else one.rear_m >= to_m + gap_needed_m(passage.speed_mps, one.speed_mps)
+            for one in self.on_road
+            if one.passage.lane == passage.lane
+        )
 
     def _cleared_before(self, passage: RoadEvent, t_s: float) -> Cleared:
         """Return what is cleared for a vehicle that waits for room to enter."""

@@ -12,10 +12,15 @@ from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.vehicle_tables import Vehicle
 from laneweave.protocol.vehicle.lane_ends import LaneEnds
 from laneweave.protocol.vehicle.motion import State, cell_state
+from laneweave.protocol.vehicle.sudden_stops import stopping_m
 from laneweave.protocol.wire.messages import ClosedFormation, CurrentMotion, Name, Sense
 from laneweave.sim_bridge.bodies.command_checks import NEIGHBOURING
-from laneweave.sim_bridge.bodies.motion_controller import FallbackLevel, MotionController
-from laneweave.sim_bridge.bodies.overlaps_and_gaps import ExactNeighbours, Size
+from laneweave.sim_bridge.bodies.motion_controller import (
+    FallbackLevel,
+    MotionController,
+    OffLatticePhase,
+)
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import ExactNeighbours, Size, corners, pose_of
 from laneweave.sim_bridge.bodies.plant import Plant
 from laneweave.sim_bridge.bodies.sensors import Sensors
 from laneweave.sim_bridge.road.demand import Arrival
@@ -95,10 +100,12 @@ class RoadVehicle:
 
     @property
     def lanes_touched(self) -> range:
-        """Lanes in which parts of the body are."""
+        """Lanes in which parts of the body are, which is turned while it changes lanes."""
         lattice = self.controller.lattice
-        first, last = lattice.lanes_touched(self.state[3], self.size[1])
-        return range(first, last + 1)
+        ys_m = [y_m for _, y_m in corners(pose_of(self.state), *self.size)]
+        first, last = min(ys_m), max(ys_m)
+        touched = lattice.lanes_touched(0.5 * (first + last), last - first)
+        return range(touched[0], touched[1] + 1)
 
     @property
     def lanes_used(self) -> set[int]:
@@ -111,9 +118,24 @@ class RoadVehicle:
         return self.controller.off_lattice is None
 
     @property
+    def stops_m(self) -> float:
+        """Where it can stop if it has not expected to."""
+        return self.state[0] + stopping_m(self.state[1])
+
+    @property
     def waits(self) -> bool:
         """Whether it waits for a lane to be open again; a vehicle that has broken down does not."""
         return not self.has_cell and self.controller.broken_mps2 is None
+
+    @property
+    def starts(self) -> bool:
+        """Whether it has waited, and is on its way into a cell."""
+        return self.controller.off_lattice is OffLatticePhase.RE_ENTERING
+
+    @property
+    def passes_m(self) -> float:
+        """Position up to which it heeds no closed part: its front, unless it starts in one."""
+        return self.controller.stop_lines.section_m(self.body_lane, self.state[0])
 
     @property
     def keeps_lane(self) -> bool:

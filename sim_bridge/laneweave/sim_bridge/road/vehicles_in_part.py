@@ -10,7 +10,7 @@ from attrs import frozen
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.lane_ends import re_entry
 from laneweave.protocol.vehicle.motion import State
-from laneweave.protocol.vehicle.sudden_stops import room_before_part_m, stops_before
+from laneweave.protocol.vehicle.sudden_stops import room_before_part_m
 from laneweave.protocol.wire.messages import Name
 
 
@@ -36,8 +36,20 @@ class BodyOnRoad(Protocol):
         """Whether it is on the lattice."""
 
     @property
+    def stops_m(self) -> float:
+        """Where it can stop if it has not expected to."""
+
+    @property
     def waits(self) -> bool:
         """Whether it waits for a lane to be open again."""
+
+    @property
+    def starts(self) -> bool:
+        """Whether it has waited, and is on its way into a cell."""
+
+    @property
+    def passes_m(self) -> float:
+        """Position up to which it heeds no closed part: its front, unless it starts in one."""
 
 
 @frozen
@@ -46,7 +58,7 @@ class VehiclesInPart:
 
     inside: tuple[Name, ...]
     near: tuple[Name, ...]
-    """Those so near that they could not stop before it, or that wait there without cells."""
+    """Those so near that they could not stop before it, or that start there, or will."""
     coming: tuple[Name, ...]
     """Those that could not stop at the stop line before it."""
 
@@ -87,15 +99,17 @@ def vehicles_in_part(
     inside, near, coming = list[Name](), list[Name](), list[Name]()
     first_m, room_m = from_m - cleared_before_m(scenario), re_entry(scenario).room_m
     for vehicle in vehicles:
-        s_m, speed_mps = vehicle.state[:2]
-        if lane not in vehicle.lanes_used or s_m - vehicle.size[0] >= to_m or s_m < first_m:
+        s_m = vehicle.state[0]
+        if lane not in vehicle.lanes_used or s_m - vehicle.size[0] >= to_m:
             continue
         if s_m >= from_m:
             inside.append(vehicle.name)
-        elif not vehicle.has_cell and from_m - s_m < room_m:
-            near.append(vehicle.name)  # it would start into the part
-        elif not stops_before(from_m, s_m, speed_mps):
+        elif (vehicle.starts and vehicle.passes_m >= first_m) or (
+            not vehicle.has_cell and from_m - s_m < room_m
+        ):
+            near.append(vehicle.name)  # it would drive into the part
+        elif vehicle.stops_m > from_m:
             near.append(vehicle.name)
-        elif not stops_before(from_m - room_m, s_m, speed_mps):
+        elif vehicle.stops_m > from_m - room_m:
             coming.append(vehicle.name)
     return VehiclesInPart(tuple(inside), tuple(near), tuple(coming))

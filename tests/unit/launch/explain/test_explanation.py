@@ -182,6 +182,100 @@ def test_an_agent_that_was_gone_for_a_while(tmp_path: Path) -> None:
     assert "from 19.0 s to 50.0 s" in found.text
 
 
+# --- closed parts -----------------------------------------------------------------------------
+
+SLOT = at(8.0, "stream-planned", slot=3, out_of_reach=[V])
+STOPS = at(30.0, "left-lattice", vehicle=V, lane=1)
+
+
+def part(kind: str, t_s: float, **data: object) -> Event:
+    """Return an event about a part of lane 1 that is closed around a vehicle that stands."""
+    where = {"lane": 1, "from_m": 500.4, "to_m": 520.4, "cause": "breakdown", "vehicle": W}
+    return at(t_s, f"part-{kind}", **{**where, "speed_mps": 0.0, **data})
+
+
+OPERATOR = {"cause": "closed", "vehicle": None}
+TRACTOR = {"cause": "passing", "vehicle": "other-1", "speed_mps": 5.0}
+
+
+@pytest.mark.parametrize(
+    ("data", "words", "story"),
+    [
+        (
+            {},
+            "lane 1, closed from 500 to 520 m (v0002 had broken down)",
+            [
+                "v0002 breaks down in lane 1, which is closed at 500 m",
+                "lane 1 open again from 500 m on",
+            ],
+        ),
+        (
+            OPERATOR,
+            "lane 1, closed from 500 to 520 m",
+            ["lane 1 closed from 500 to 520 m", "lane 1 open again from 500 m on"],
+        ),
+        (
+            TRACTOR,
+            "other-1, a vehicle of another system, in lane 1",
+            [
+                "other-1, a vehicle of another system, enters lane 1 at 5.0 m/s",
+                "other-1 has left lane 1",
+            ],
+        ),
+    ],
+)
+def test_a_closed_part_is_the_reason_while_it_is_closed(
+    data: dict[str, object], words: str, story: list[str], tmp_path: Path
+) -> None:
+    begins, ends = part("closed", 1.0, **data), part("opened", 9.0, **data)
+    found = explained(tmp_path, [LEADER, begins, ENTERED, SLOT, ends, *OLD_OFF])
+    assert found.reason == Reason.CLOSED_PART
+    assert found.text.endswith(f"the plan of 8.0 s had no path to its lane because of {words}")
+    told = [line.text for line in found.story if line.kind.startswith("part-")]
+    assert told == story
+
+    earlier = explained(tmp_path, [LEADER, begins, part("opened", 1.5, **data), ENTERED, SLOT])
+    assert all(not line.kind.startswith("part-") for line in earlier.story)
+    other_lane = [
+        part(kind, t_s, **data, lane=3) for kind, t_s in (("closed", 1.0), ("opened", 9.0))
+    ]
+    for parts in ([begins, part("opened", 7.0, **data)], other_lane):
+        found = explained(tmp_path, [LEADER, ENTERED, SLOT, *parts, *OLD_OFF])
+        assert found.reason == Reason.NO_ROOM
+
+
+def test_a_vehicle_that_stops_before_a_closed_part(tmp_path: Path) -> None:
+    grown = part("closed", 27.0, to_m=560.0)
+    parts = [part("closed", 20.0), grown, part("opened", 40.0)]
+    found = explained(tmp_path, [LEADER, ENTERED, STOPS, *parts, *OLD_OFF])
+    where = "lane 1, closed from 500 to 560 m (v0002 had broken down)"
+    assert found.reason == Reason.CLOSED_PART
+    assert found.text == f"v0001 missed its goal (lane 2): it stopped at 30.0 s before {where}"
+    assert f"stops before {where}" in [line.text for line in found.story]
+    # It stopped when the part was open again.
+    found = explained(
+        tmp_path, [LEADER, ENTERED, STOPS, part("closed", 10.0), part("opened", 20.0)]
+    )
+    assert found.reason == Reason.STOPPED
+
+
+def test_a_vehicle_that_has_broken_down(tmp_path: Path) -> None:
+    parts = [part("closed", 30.0, vehicle=V), part("opened", 40.0, vehicle=V)]
+    found = explained(tmp_path, [LEADER, ENTERED, STOPS, *parts, *OLD_OFF])
+    assert found.reason == Reason.BROKE_DOWN
+    assert found.text.endswith("it broke down at 30.0 s, in lane 1")
+    told = [line.text for line in found.story if 20.0 < line.t_s < 50.0]
+    assert told == ["breaks down in lane 1", "lane 1 open again from 500 m on"]
+
+
+def test_a_plan_that_a_closed_part_kept_from_being_completed(tmp_path: Path) -> None:
+    planned = [LEADER, ENTERED, CLOSED, PLAN, IN_FORCE]
+    found = explained(tmp_path, [*planned, part("closed", 20.0), *OFF])
+    assert found.reason == Reason.CLOSED_PART
+    assert "not completed it because of lane 1, closed" in found.text
+    assert explained(tmp_path, [*planned, *OFF]).reason == Reason.NOT_COMPLETED
+
+
 def test_a_reference_method_makes_no_plans(tmp_path: Path) -> None:
     found = explained(tmp_path, [ENTERED, *OLD_OFF])
     assert found.reason == Reason.METHOD

@@ -186,7 +186,8 @@ def test_vehicles_drive_out_into_a_lane_that_is_open(
     scenario = with_closures(*closures)
     lane = closures[0].lane
     (end,) = (end for end in dead_ends(scenario) if end.lane == lane)
-    assert lane_beside(scenario, end) == beside
+    sections = sections_to_lines(scenario)
+    assert lane_beside(scenario, end.lane, end.line_m, sections) == beside
 
 
 # --- re-entry ---------------------------------------------------------------------------------

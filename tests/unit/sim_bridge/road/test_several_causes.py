@@ -1,0 +1,79 @@
+"""Breakdowns, closed parts and vehicles of other systems in one lane, as many as there may be."""
+
+from __future__ import annotations
+
+from random import Random
+
+import pytest
+from attrs import evolve
+
+from laneweave.protocol.scenario.road_tables import Demand, RoadEvent
+from laneweave.sim_bridge.road.obstacles import Breakdown
+from support.closed_lanes import LonelyRoad, road_with
+from support.variants import variants
+
+ROAD = road_with(s3_m=850.0)
+END_S = 1500.0
+"""Everybody has left long before."""
+
+
+def drawn_event(random: Random, lane: int) -> RoadEvent:
+    """Return a slow vehicle, a fast one or a part that is closed."""
+    lane = lane if random.random() < 0.8 else random.randrange(3)
+    length_m, kind = random.uniform(3.0, 12.0), random.random()
+    first_m, last_m = (
+        (85.0, 800.0) if kind < 0.35 else (0.0, 200.0) if kind < 0.75 else (150.0, 700.0)
+    )
+    from_m = random.uniform(first_m, last_m)
+    if kind >= 0.75:
+        length_m = random.uniform(5.0, 150.0)
+    at_s = random.uniform(5.0, 60.0)
+    event = RoadEvent(lane, from_m, from_m + length_m, at_s)
+    if 0.35 <= kind < 0.75:
+        speed_mps = random.choice([15.0, 17.0, 20.0, 25.0, 30.0, 40.0])
+        return evolve(event, speed_mps=speed_mps, clear_s=random.uniform(0.0, 30.0))
+    if kind < 0.35:
+        event = evolve(event, speed_mps=random.choice([0.5, 2.0, 5.0, 10.0, 14.9]))
+        return evolve(event, for_s=random.uniform(20.0, 80.0), clear_s=random.uniform(0.0, 30.0))
+    return evolve(event, for_s=random.uniform(5.0, 60.0), clear_s=random.uniform(0.0, 30.0))
+
+
+def drawn_breakdown(random: Random, lane: int) -> Breakdown:
+    return Breakdown(
+        random.uniform(20.0, 70.0),
+        lane=lane if random.random() < 0.8 else random.randrange(3),
+        at_m=random.uniform(60.0, 800.0),
+        decel_mps2=random.uniform(1.0, 8.0),
+        for_s=random.uniform(1.0, 60.0),
+    )
+
+
+def drawn_road(seed: int) -> LonelyRoad:
+    random = Random(seed)
+    lane = random.randrange(3)
+    events = tuple(drawn_event(random, lane) for _ in range(random.randrange(1, 4)))
+    breakdowns = [drawn_breakdown(random, lane) for _ in range(random.randrange(1, 4))]
+    volume = random.choice([200.0, 600.0, 1000.0, 1500.0])
+    demand = Demand(volume_veh_per_lane_h=volume, duration_s=60.0)
+    road = evolve(ROAD.road, events=events)
+    return LonelyRoad(evolve(ROAD, demand=demand, seed=seed % 7, road=road), breakdowns)
+
+
+FOUND = (27, 57, 127, 14, 20, 28, 34, 41, 44, 54, 60, 69, 103, 143, 275, 281, 305)
+"""Seeds that found vehicles in closed parts, or vehicles that waited for ever."""
+
+
+@pytest.mark.parametrize(
+    "seed",
+    [
+        *variants(list(FOUND), 3),
+        *(pytest.param(seed, marks=pytest.mark.full) for seed in range(1000, 1300)),
+    ],
+)
+def test_nobody_touches_anybody_or_is_in_a_closed_part_and_all_leave(seed: int) -> None:
+    road = drawn_road(seed)
+    demand, passing = road.roadside.demand, road.roadside.obstacles.passing
+    while road.vehicles or passing.on_road or not demand.exhausted(road.t_s):
+        road.step()
+        assert road.overlaps == []
+        assert road.t_s < END_S, f"still on the road: {sorted(road.vehicles)}"
