@@ -69,6 +69,7 @@ MARKED = (
     "tests/unit/sim_bridge/road/test_lane_end_control.py",
     "tests/unit/sim_bridge/road/test_obstacles.py",
     "tests/unit/sim_bridge/road/test_passing_vehicles.py",
+    "tests/unit/sim_bridge/road/test_several_causes.py",
 )
 """Where tests with the marker are."""
 JOBS = 2

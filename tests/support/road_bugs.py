@@ -16,6 +16,7 @@ from laneweave.protocol.scenario.vehicle_types import VehicleTypes
 from laneweave.protocol.vehicle.lane_end import LaneEnd, ReEntry
 from laneweave.protocol.vehicle.lane_ends import LaneEnds
 from laneweave.protocol.vehicle.plan_execution import PlanExecution
+from laneweave.protocol.vehicle.sudden_stops import stopping_m
 from laneweave.protocol.wire.messages import Census, CensusEntry, Command, Name, Sense
 from laneweave.sim_bridge.bodies import motion_controller
 from laneweave.sim_bridge.bodies.motion_controller import MotionController, OffLatticePhase
@@ -266,12 +267,6 @@ def controllers_do_not_know(*_: object) -> None:
     """Motion controllers do not learn which parts are closed."""
 
 
-@breaks(OBSTACLES, LaneEndControl, "_may_take")
-def gaps_are_taken_whatever_is_closed(*_: object) -> bool:
-    """Vehicles start into gaps in lanes that have been closed meanwhile, or beyond the line."""
-    return True
-
-
 @breaks(OBSTACLES, LaneEndControl, "_opens")
 def vehicles_start_before_the_next_dead_end(
     _opens: Call, self: LaneEndControl, at: LanePosition, _vehicle: RoadVehicle
@@ -284,7 +279,11 @@ def vehicles_start_before_the_next_dead_end(
 def parts_are_closed_before_vehicles_that_start(patch: Patch) -> None:
     """A part is closed although a vehicle has started that heeds no closed part there."""
     patch.setattr(RoadVehicle, "starts", False)
-    patch.setattr(RoadVehicle, "passes_m", property(lambda self: self.state[0]))
+    patch.setattr(RoadVehicle, "stops_m", property(_stops_m))
+
+
+def _stops_m(self: RoadVehicle) -> float:
+    return self.state[0] + stopping_m(self.state[1])
 
 
 @breaks(OBSTACLES, LaneEnds, "enters_cleared")

@@ -114,11 +114,6 @@ class PassingVehicle:
         return False
 
     @property
-    def passes_m(self) -> float:
-        """Position up to which it heeds no closed part: its front."""
-        return self.s_m
-
-    @property
     def rear_m(self) -> float:
         """Position of its rear."""
         return self.s_m - self.length_m

@@ -119,8 +119,12 @@ class RoadVehicle:
 
     @property
     def stops_m(self) -> float:
-        """Where it can stop if it has not expected to."""
-        return self.state[0] + stopping_m(self.state[1])
+        """Where it can stop if it has not expected to.
+
+        After it has started in a part that is open again, it stops only beyond that.
+        """
+        s_m, speed_mps = self.state[:2]
+        return self.controller.stop_lines.section_m(self.body_lane, s_m) + stopping_m(speed_mps)
 
     @property
     def waits(self) -> bool:
@@ -131,11 +135,6 @@ class RoadVehicle:
     def starts(self) -> bool:
         """Whether it has waited, and is on its way into a cell."""
         return self.controller.off_lattice is OffLatticePhase.RE_ENTERING
-
-    @property
-    def passes_m(self) -> float:
-        """Position up to which it heeds no closed part: its front, unless it starts in one."""
-        return self.controller.stop_lines.section_m(self.body_lane, self.state[0])
 
     @property
     def keeps_lane(self) -> bool:

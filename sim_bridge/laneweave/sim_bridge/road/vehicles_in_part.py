@@ -47,10 +47,6 @@ class BodyOnRoad(Protocol):
     def starts(self) -> bool:
         """Whether it has waited, and is on its way into a cell."""
 
-    @property
-    def passes_m(self) -> float:
-        """Position up to which it heeds no closed part: its front, unless it starts in one."""
-
 
 @frozen
 class VehiclesInPart:
@@ -104,7 +100,7 @@ def vehicles_in_part(
             continue
         if s_m >= from_m:
             inside.append(vehicle.name)
-        elif (vehicle.starts and vehicle.passes_m >= first_m) or (
+        elif (vehicle.starts and vehicle.stops_m >= first_m) or (
             not vehicle.has_cell and from_m - s_m < room_m
         ):
             near.append(vehicle.name)  # it would drive into the part

@@ -9,6 +9,8 @@ from attrs import evolve
 
 from laneweave.protocol.scenario.road_tables import Demand, RoadEvent
 from laneweave.sim_bridge.road.obstacles import Breakdown
+from support import road_bugs
+from support.bugs import Bug, catches
 from support.closed_lanes import LonelyRoad, road_with
 from support.variants import variants
 
@@ -56,10 +58,32 @@ def drawn_road(seed: int) -> LonelyRoad:
     volume = random.choice([200.0, 600.0, 1000.0, 1500.0])
     demand = Demand(volume_veh_per_lane_h=volume, duration_s=60.0)
     road = evolve(ROAD.road, events=events)
-    return LonelyRoad(evolve(ROAD, demand=demand, seed=seed % 7, road=road), breakdowns)
+    return LonelyRoad(evolve(ROAD, demand=demand, seed=seed % 7, road=road), tuple(breakdowns))
 
 
-FOUND = (27, 57, 127, 14, 20, 28, 34, 41, 44, 54, 60, 69, 103, 143, 275, 281, 305)
+FOUND = (
+    27,
+    57,
+    127,
+    14,
+    20,
+    28,
+    34,
+    41,
+    44,
+    54,
+    60,
+    69,
+    103,
+    115,
+    143,
+    194,
+    275,
+    281,
+    305,
+    338,
+    459,
+)
 """Seeds that found vehicles in closed parts, or vehicles that waited for ever."""
 
 
@@ -71,7 +95,28 @@ FOUND = (27, 57, 127, 14, 20, 28, 34, 41, 44, 54, 60, 69, 103, 143, 275, 281, 30
     ],
 )
 def test_nobody_touches_anybody_or_is_in_a_closed_part_and_all_leave(seed: int) -> None:
-    road = drawn_road(seed)
+    run_to_end(drawn_road(seed))
+
+
+@pytest.mark.more
+@pytest.mark.parametrize(
+    ("bug", "seed"),
+    [
+        pytest.param(bug, seed, id=bug.name, marks=catches(bug))
+        for bug, seed in (
+            (road_bugs.vehicles_start_before_the_next_dead_end, 44),
+            (road_bugs.parts_are_closed_before_vehicles_that_start, 20),
+        )
+    ],
+)
+def test_planted_bugs_are_noticed(bug: Bug, seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    bug.plant(monkeypatch)
+    with pytest.raises(AssertionError):
+        run_to_end(drawn_road(seed))
+
+
+def run_to_end(road: LonelyRoad) -> None:
+    """Check each tick until all have left the road."""
     demand, passing = road.roadside.demand, road.roadside.obstacles.passing
     while road.vehicles or passing.on_road or not demand.exhausted(road.t_s):
         road.step()
