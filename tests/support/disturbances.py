@@ -108,11 +108,11 @@ class DisturbedPlant(Plant):
         """Longitudinal acceleration that is forced; None: none."""
         self._length_s = tick_s
 
-    def step(self, jerk_s: float, jerk_y: float) -> State:
+    def step(self, jerk_s: float, jerk_y: float, *, parks: bool = False) -> State:
         """Move on by one tick; the forced acceleration replaces the longitudinal jerk."""
         if self.forced_mps2 is not None:
             jerk_s = (self.forced_mps2 - self.setpoint[0]) / self._length_s
-        return super().step(jerk_s, jerk_y)
+        return super().step(jerk_s, jerk_y, parks=parks)
 
 
 @define

@@ -267,18 +267,18 @@ def controllers_do_not_know(*_: object) -> None:
     """Motion controllers do not learn which parts are closed."""
 
 
-@breaks(OBSTACLES, LaneEndControl, "_opens")
+@breaks(OBSTACLES, LaneEndControl, "_starts_in_own_lane")
 def vehicles_start_before_the_next_dead_end(
-    _opens: Call, self: LaneEndControl, at: LanePosition, _vehicle: RoadVehicle
+    _starts: Call, self: LaneEndControl, at: LanePosition, vehicle: RoadVehicle
 ) -> bool:
     """A vehicle starts in its own lane although another part of it is closed ahead."""
-    return at in self.over
+    return self._is_open(at, vehicle)
 
 
 @breaks(OBSTACLES)
 def parts_are_closed_before_vehicles_that_start(patch: Patch) -> None:
     """A part is closed although a vehicle has started that heeds no closed part there."""
-    patch.setattr(RoadVehicle, "starts", False)
+    patch.setattr(RoadVehicle, "re_enters", False)
     patch.setattr(RoadVehicle, "stops_m", property(_stops_m))
 
 

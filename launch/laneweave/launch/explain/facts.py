@@ -8,6 +8,7 @@ from typing import Any
 
 from attrs import define, field
 
+from laneweave.protocol.road_layout import ANY_LANE
 from laneweave.protocol.wire import events as kinds
 
 Event = Mapping[str, Any]
@@ -125,6 +126,8 @@ class Facts:
     """Number of plans of slots that failed or were late while it was on the road."""
     lane_end: Event | None = None
     """The newest `left-lattice` or `missed-exit`."""
+    drives_again: bool = False
+    """Whether it has had a cell again after it had none."""
     stands: bool = False
     """Whether it has no cell: it has stopped before the end of its lane."""
     absences: list[Absence] = field(factory=list)
@@ -149,7 +152,7 @@ class Facts:
     @property
     def breakdown(self) -> ClosedPart | None:
         """Its own breakdown, if it has had one: the newest."""
-        own = (one for one in self.closed_parts if one.first["vehicle"] == self.vehicle)
+        own = (one for one in self.closed_parts if one.first.get("vehicle") == self.vehicle)
         return max(own, key=lambda one: float(one.first["t_s"]), default=None)
 
     def closed_between(self, since_s: float, until_s: float) -> list[ClosedPart]:
@@ -159,7 +162,7 @@ class Facts:
             for event in (self.entered, self.left)
             if event is not None
             for key in ("lane", "preferred_lane")
-            if key in event
+            if event.get(key, ANY_LANE) != ANY_LANE
         ]
         return [
             one
@@ -172,8 +175,19 @@ class Facts:
     def stopped_before(self, event: Event) -> ClosedPart | None:
         """Return the closed part before which it stopped, with its event `left-lattice`."""
         t_s = float(event["t_s"])
-        parts = (one for one in self.closed_parts if one.first["lane"] == event["lane"])
-        return next((one for one in parts if one.meets(t_s, t_s)), None)
+        found = [
+            one
+            for one in self.closed_parts
+            if one.first["lane"] == event["lane"] and one.meets(t_s, t_s)
+        ]
+        own = (one for one in found if self._breaks_down(one, t_s))
+        others = (one for one in reversed(found) if one.first.get("vehicle") != self.vehicle)
+        return next(own, next(others, None))
+
+    def _breaks_down(self, part: ClosedPart, t_s: float) -> bool:
+        """Return whether a part begins with its own breakdown at a road time."""
+        first = part.first
+        return first.get("vehicle") == self.vehicle and float(first["t_s"]) == t_s
 
     @property
     def absence(self) -> Absence | None:
@@ -287,7 +301,7 @@ def _add_part(facts: Facts, event: Event) -> None:
 
 def _part_of(event: Event) -> tuple[object, ...]:
     """Return what identifies a part while it is closed."""
-    return event["lane"], event["cause"], event["vehicle"], event["from_m"]
+    return tuple(event.get(key) for key in ("lane", "cause", "vehicle", "from_m"))
 
 
 def _add_own(facts: Facts, event: Event) -> None:
@@ -304,7 +318,7 @@ def _add_own(facts: Facts, event: Event) -> None:
             facts.lane_end = event
             facts.stands = event["kind"] == kinds.LEFT_LATTICE
         case kinds.ENTERED_LATTICE:
-            facts.stands = False
+            facts.stands, facts.drives_again = False, True
         case kinds.AGENT_MISSING:
             facts.never_attended = True
         case _:

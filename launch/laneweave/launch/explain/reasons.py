@@ -81,7 +81,7 @@ _OF_ABSENCE: Mapping[str, Reason] = {
 def reason_of(facts: Facts) -> Finding:
     """Return why a vehicle that has left the road missed its lane."""
     breakdown = facts.breakdown
-    if breakdown is not None:
+    if breakdown is not None and not facts.drives_again:
         first = breakdown.first
         text = f"it broke down at {seconds(first['t_s'])}, in lane {first['lane']}"
         return Finding(Reason.BROKE_DOWN, text)
@@ -182,13 +182,14 @@ def _unreached(facts: Facts) -> Finding | None:
 
 
 def _closed(facts: Facts) -> Finding | None:
-    """Return the reason if nothing but closed parts kept a plan from being completed."""
+    """Return the reason if a part was closed while a plan was not completed."""
     if facts.entered is None:
         return None
-    parts = facts.closed_between(facts.entered["t_s"], facts.end_s)
+    planned_s = facts.entered["t_s"] if facts.in_force_s is None else facts.in_force_s
+    parts = facts.closed_between(planned_s, facts.end_s)
     if not parts:
         return None
-    text = f"it had a plan, but has not completed it because of {closed_part(parts[-1])}"
+    text = f"it had a plan, but has not completed it in the time of {closed_part(parts[-1])}"
     return Finding(Reason.CLOSED_PART, text)
 
 

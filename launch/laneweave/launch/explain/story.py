@@ -64,7 +64,7 @@ def _lines(facts: Facts) -> Iterator[StoryLine]:
             text = _of_others(kind, events)
         elif kind == kinds.LEFT_LATTICE:
             text = _stops(facts, events[0])
-        elif kind == kinds.PART_CLOSED and events[0]["vehicle"] == facts.vehicle:
+        elif kind == kinds.PART_CLOSED and events[0].get("vehicle") == facts.vehicle:
             text = f"breaks down in lane {events[0]['lane']}"
         else:
             text = _TEXTS[kind](events[0]) if kind in _TEXTS else ""
@@ -138,7 +138,7 @@ def _stops(facts: Facts, event: Event) -> str:
     part = facts.stopped_before(event)
     if part is None:
         return f"stops before the end of lane {event['lane']}"
-    if part.first["vehicle"] == facts.vehicle:
+    if part.first.get("vehicle") == facts.vehicle:
         return ""  # it is the part
     return f"stops before {closed_part(part)}"
 
@@ -146,22 +146,22 @@ def _stops(facts: Facts, event: Event) -> str:
 def closed_part(part: ClosedPart) -> str:
     """Return a part of a lane that was closed, and why, as a noun."""
     event = part.newest
-    lane, vehicle = event["lane"], event["vehicle"]
-    if event["cause"] == obstacle_messages.PASSING:
+    lane, vehicle = event["lane"], event.get("vehicle")
+    if event.get("cause") == obstacle_messages.PASSING:
         return f"{vehicle}, a vehicle of another system, in lane {lane}"
     where = f"lane {lane}, closed from {event['from_m']:.0f} to {event['to_m']:.0f} m"
     return (
         f"{where} ({vehicle} had broken down)"
-        if event["cause"] == obstacle_messages.BREAKDOWN
+        if event.get("cause") == obstacle_messages.BREAKDOWN
         else where
     )
 
 
 def _part_closed(event: Event) -> str:
-    lane, vehicle = event["lane"], event["vehicle"]
-    match event["cause"]:
+    lane, vehicle = event["lane"], event.get("vehicle")
+    match event.get("cause"):
         case obstacle_messages.PASSING:
-            speed = f"at {event['speed_mps']:.1f} m/s"
+            speed = f"at {event.get('speed_mps', 0.0):.1f} m/s"
             return f"{vehicle}, a vehicle of another system, enters lane {lane} {speed}"
         case obstacle_messages.BREAKDOWN:
             return (
@@ -172,8 +172,8 @@ def _part_closed(event: Event) -> str:
 
 
 def _part_opened(event: Event) -> str:
-    if event["cause"] == obstacle_messages.PASSING:
-        return f"{event['vehicle']} has left lane {event['lane']}"
+    if event.get("cause") == obstacle_messages.PASSING:
+        return f"{event.get('vehicle')} has left lane {event['lane']}"
     return f"lane {event['lane']} open again from {event['from_m']:.0f} m on"
 
 

@@ -70,8 +70,6 @@ from laneweave.sim_bridge.bodies.plant import Plant
 from laneweave.sim_bridge.bodies.record_store import RecordStore
 from laneweave.sim_bridge.bodies.stop_lines import STANDING_MPS, StopLinesAhead
 
-PARKED_MPS = 0.05
-"""Speed below which a brake holds a vehicle that is to stand, whatever is measured."""
 SLOWED_MPS = 2.0
 """Loss of speed from which a body does not enter another lane."""
 RELEASE_M = 1.0
@@ -197,20 +195,16 @@ class MotionController:
         """
         if self.off_lattice is OffLatticePhase.WAITING or not self.stop_lines.lane_ends:
             return False
-        ends, starts = self.stop_lines.lane_ends, self.off_lattice is OffLatticePhase.RE_ENTERING
-        if starts and self.stop_lines.passed:
-            # Unless a part of the other lane is closed meanwhile, so that it has to stand.
-            cell, (s_m, speed_mps, *_) = self.hold_cell, self.measured
-            body_m = self.stop_lines.section_m(cell[1], s_m)
-            return speed_mps < STANDING_MPS and ends.has_passed(cell, t_s, body_m=body_m)
+        leaves = self.off_lattice is OffLatticePhase.RE_ENTERING and self.stop_lines.passed
         stays_free = self.store.territory.given_up_cells_stay_free
         first, last = self.lattice.lanes_touched(self.measured[3], self._limits.width_m)
-        if not stays_free and first != last and self.measured[1] > STANDING_MPS:
-            return False
+        drives = self.measured[1] > STANDING_MPS
+        if drives and (leaves or (not stays_free and first != last)):
+            return False  # one that leaves its lane stands if the other one is closed meanwhile
         # Behind an exit the lane may belong to a ramp, to whose end the body does not come.
-        cell = self.hold_cell[0], self._body_lane
+        cell = self.hold_cell if leaves else (self.hold_cell[0], self._body_lane)
         body_m = self.stop_lines.section_m(cell[1], self.measured[0])
-        return ends.has_passed(cell, t_s, body_m=body_m)
+        return self.stop_lines.lane_ends.has_passed(cell, t_s, body_m=body_m)
 
     @property
     def keeps_lane(self) -> bool:
@@ -400,10 +394,8 @@ class MotionController:
             # The body leaves its trajectory.
             self._jerks = self._jerks[:0]
             plant.brake(jerk[1])
-        elif (self.stays or self.broken_mps2 is not None) and plant.state[1] < PARKED_MPS:
-            plant.brake(jerk[1])
         else:
-            plant.step(*jerk)
+            plant.step(*jerk, parks=self.stays or self.broken_mps2 is not None)
         self.level = level
         self.level_ticks[level] += 1
         self._measured = None

@@ -15,6 +15,8 @@ from laneweave.protocol.vehicle.motion import Jerk, State, commanded_state, inte
 
 Axis = tuple[float, float, float]
 """(position [m], speed [m/s], acceleration [m/s2])."""
+PARKED_MPS = 0.05
+"""Speed below which a vehicle stands that is to stand."""
 
 
 class Plant:
@@ -42,8 +44,13 @@ class Plant:
         """Acceleration set-points, along and across [m/s2]."""
         return self._setpoint
 
-    def step(self, jerk_s: float, jerk_y: float) -> State:
-        """Move by one tick with limited jerks [m/s3]; return the new state."""
+    def step(self, jerk_s: float, jerk_y: float, *, parks: bool = False) -> State:
+        """Move by one tick with limited jerks [m/s3]; return the new state.
+
+        `parks`: once it stands, the brake holds it, whatever the errors of measurement are.
+        """
+        if parks and self._state[1] < PARKED_MPS:
+            return self.brake(jerk_y)
         commanded = commanded_state(self._state, self._setpoint, self.limits, 0.0)
         self._move(commanded, limited_jerk(commanded, (jerk_s, jerk_y), self.limits, self._tick_s))
         return self._state

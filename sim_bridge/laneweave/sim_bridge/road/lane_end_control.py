@@ -94,8 +94,8 @@ class LaneEndControl:
         """Those of the road, up to the stop lines in them."""
         self._columns, self._distance_m, self._room_m = 0, 0.0, 0.0
         self._gaps: dict[LanePosition, list[Gap]] = {}
-        self.over: frozenset[LanePosition] = frozenset()
-        """Ends of which the cause is over."""
+        self.still_closed: Sequence[TemporaryClosure] = ()
+        """Parts that are closed for a time and are not over."""
         self._last_gap_column: dict[int, float] = {}
         """Rearmost column of the last gap, by entry point."""
         self._entered_gaps: list[range] = []
@@ -168,10 +168,10 @@ class LaneEndControl:
             elif (missed and self._cells_stay_free) or controller.has_lost_cell(t_s):
                 # While it re-enters, a vehicle may come to another dead end.
                 yield self.take_off(name, vehicle)
-            elif controller.off_lattice is OffLatticePhase.WAITING and controller.stays:
+            elif controller.off_lattice is OffLatticePhase.WAITING:
                 # Parts that are closed for a time come and go ahead of it.
                 lane, s_m = controller.hold_cell[1], vehicle.state[0]
-                self._end_of[name] = self._end_ahead(lane, s_m) or self._end_of.get(name)
+                self._end_of[name] = self._end_ahead(lane, s_m)
         for at, gaps in self._gaps.items():
             startable = self._startable(at, vehicles)
             if startable:
@@ -209,57 +209,86 @@ class LaneEndControl:
 
     def _request(self, at: LanePosition, vehicle: RoadVehicle, gaps: list[Gap], t_s: float) -> None:
         """Keep the next columns free for a vehicle, unless the last gap was too close ahead."""
-        over = self._opens(at, vehicle)
-        lane = at[0] if over else self._beside(at, vehicle)
+        own = self._starts_in_own_lane(at, vehicle)
+        lane = at[0] if own else self._beside(at, vehicle)
         if lane is None:
-            return  # SUMO takes the vehicle back
+            return  # SUMO takes the vehicle back, or it waits until a lane is open
         # Behind the first entry point of the lane, vehicles may own its cells.
         point = lane
         taken = self._meter.points_kept_free(point)
         crowded = any(arrival.entry_point in taken for arrival in self._meter.waiting)
         between = (CROWDED_GAPS if crowded else OPEN_GAPS) * self._columns
-        if over:
-            between = 0  # no other vehicle uses the lane
+        if own:
+            between = 0  # others enter the lane only behind it
         last = self._last_gap_column.get(point, math.inf)
         if self._meter.next_column(point) < last - between:
             columns = self._meter.keep_free(point, self._columns, t_s)
             self._last_gap_column |= dict.fromkeys(taken, columns[0])
             gaps.append(Gap(lane, columns))
 
-    def _opens(self, at: LanePosition, vehicle: RoadVehicle) -> bool:
-        """Return whether a vehicle starts in its own lane, from where it waits.
+    def _is_open(self, at: LanePosition, vehicle: RoadVehicle) -> bool:
+        """Return whether nothing is closed any more at a dead end ahead of a vehicle.
 
-        The cause of its dead end is over, or its body is beyond what is closed there, and it
-        settles before the next dead end ahead of its body.
+        Its cause is over, or the body is beyond what is closed there.
         """
         end, s_m = self._ends[at], vehicle.state[0]
-        if at not in self.over and s_m < end.reopens_m:
-            return False
-        settles_m = max(end.reopens_m, s_m) + self._distance_m
-        return all(
-            other.line_m >= settles_m
-            for other in self._ends.values()
-            if other.lane == end.lane and other.end_m > end.end_m and other.reopens_m > s_m
+        return s_m >= end.reopens_m or (
+            end.sudden
+            and not any(
+                part.lane == end.lane and s_m < part.to_m and part.from_m < end.reopens_m
+                for part in self.still_closed
+            )
         )
 
-    def _is_before_line(self, at: LanePosition, vehicle: RoadVehicle) -> bool:
-        """Return whether a vehicle has the room before a dead end to start beside it."""
-        return vehicle.state[0] <= self._ends[at].line_m + NEAR_LINE_M
+    def _later(self, at: LanePosition, vehicle: RoadVehicle) -> Iterator[LaneEnd]:
+        """Yield the dead ends of a lane after one of them, ahead of a body."""
+        end, s_m = self._ends[at], vehicle.state[0]
+        for other in self._ends.values():
+            if other.lane == end.lane and other.end_m > end.end_m and s_m < other.reopens_m:
+                yield other
+
+    def _starts_in_own_lane(self, at: LanePosition, vehicle: RoadVehicle) -> bool:
+        """Return whether a vehicle may start in its own lane, from where it waits.
+
+        The lane is open, and the vehicle settles before the line of the next dead end.
+        """
+        settles_m = max(self._ends[at].reopens_m, vehicle.state[0]) + self._distance_m
+        return self._is_open(at, vehicle) and all(
+            other.line_m >= settles_m for other in self._later(at, vehicle)
+        )
 
     def _beside(self, at: LanePosition, vehicle: RoadVehicle) -> int | None:
-        """Return the lane into which a vehicle at a dead end re-enters; None: there is none now."""
+        """Return the lane into which a vehicle at a dead end re-enters; None: there is none now.
+
+        It needs room in its own lane until it is out of it.
+        """
         end, s_m = self._ends[at], vehicle.state[0]
-        opens = self._opens(at, vehicle)
-        if end.taken_back or not (opens or self._is_before_line(at, vehicle)):
+        if end.taken_back:
             return None
-        # Before a part that is closed for a time, it starts from where it stands.
-        at_m = s_m if opens else min(s_m, end.line_m) if end.sudden else end.line_m
+        at_m = min(s_m, end.line_m)
+        if s_m > end.line_m + NEAR_LINE_M:
+            needed_m = s_m + self._room_m
+            if not self._is_open(at, vehicle) or any(
+                other.end_m < needed_m for other in self._later(at, vehicle)
+            ):
+                return None
+            at_m = s_m
+        elif not vehicle.controller.stays:
+            at_m = end.line_m  # it drives up to the line
         return lane_beside(self._scenario, end.lane, at_m, self._sections)
+
+    def _may_start(self, at: LanePosition, vehicle: RoadVehicle) -> bool:
+        """Return whether a vehicle has room to start from where it waits."""
+        return (
+            vehicle.state[0] <= self._ends[at].line_m + NEAR_LINE_M
+            or self._starts_in_own_lane(at, vehicle)
+            or self._beside(at, vehicle) is not None
+        )
 
     def _may_take(self, gap: Gap, at: LanePosition, vehicle: RoadVehicle) -> bool:
         """Return whether a gap can be for a vehicle, as its lane and the one beside it are now."""
         if gap.lane == at[0]:
-            return self._opens(at, vehicle)
+            return self._starts_in_own_lane(at, vehicle)
         return gap.lane == self._beside(at, vehicle)
 
     def take_off(self, name: Name, vehicle: RoadVehicle) -> LaneEndChange:
@@ -282,17 +311,21 @@ class LaneEndControl:
     ) -> list[RoadVehicle]:
         """Return the vehicles that may start from where they wait, foremost first.
 
-        Those beyond the line have no room to start before what is ahead is gone.
+        None may while others wait so near ahead of the first, at this dead end or the next one,
+        that it has no room to start.
         """
-        waiting = self._waiting(at, vehicles)
-        startable = [
-            one for one in waiting if self._opens(at, one) or self._is_before_line(at, one)
-        ]
-        beyond = waiting[: waiting.index(startable[0])] if startable else ()
-        if startable and beyond:
-            rear_m = beyond[-1].state[0] - beyond[-1].size[0]
-            return startable if rear_m - startable[0].state[0] >= self._room_m else []
-        return startable
+        startable = [one for one in self._waiting(at, vehicles) if self._may_start(at, one)]
+        if not startable:
+            return []
+        s_m = startable[0].state[0]
+        ahead_m = (
+            one.state[0] - one.size[0]
+            for other in self._ends
+            if other[0] == at[0]
+            for one in self._waiting(other, vehicles)
+            if one.state[0] > s_m
+        )
+        return startable if min(ahead_m, default=math.inf) - s_m >= self._room_m else []
 
     def _waiting(self, at: LanePosition, vehicles: Mapping[Name, RoadVehicle]) -> list[RoadVehicle]:
         """Return the vehicles that wait at a dead end, foremost first."""

@@ -155,32 +155,18 @@ class Obstacles:
         """Return the parts in which no vehicle may be."""
         return [one.part for one in self.active if one.kind == CLOSED and not one.is_over(t_s)]
 
-    def over(self, t_s: float) -> frozenset[LanePosition]:
-        """Return where those begin whose cause is over, although vehicles still wait there.
+    def still_closed(self, t_s: float) -> list[TemporaryClosure]:
+        """Return the parts whose cause is not over, before which vehicles have to wait.
 
-        While another part that is still closed is so near ahead that a vehicle that has started
-        would pass its stop line before it is in its cell, vehicles wait for that one, too; but not
-        for a vehicle of another system that stands, since it waits for them.
+        One around a vehicle of another system that stands behind one that waits is none of them,
+        since it waits for that one.
         """
-        closed = [
+        return [
             one.part
             for one in self.active
             if not one.is_over(t_s)
             and not (one.vehicle is not None and self.passing.is_blocked(one.vehicle))
         ]
-        settles_m = re_entry(self._scenario).distance_m if self.active else 0.0
-
-        def is_free(part: TemporaryClosure) -> bool:
-            return not any(
-                other.lane == part.lane
-                and other.to_m > part.from_m
-                and self._line_m(other) < part.to_m + settles_m
-                for other in closed
-            )
-
-        return frozenset(
-            one.begins_at for one in self.active if one.is_over(t_s) and is_free(one.part)
-        )
 
     def update(
         self, vehicles: Mapping[Name, RoadVehicle], t_s: float, in_use: Collection[LanePosition]

@@ -96,11 +96,12 @@ class PassingVehicle:
     @property
     def stops_m(self) -> float:
         """Where it can stop if it has not expected to."""
-        return self.s_m + MIN_GAP_M + self.speed_mps**2 / (2.0 * HARDEST_MPS2) + self.speed_mps
+        reacts_m = self.speed_mps * REACTION_S
+        return self.s_m + MIN_GAP_M + reacts_m + self.speed_mps**2 / (2.0 * HARDEST_MPS2)
 
     @property
     def has_cell(self) -> bool:
-        """Whether it waits for no cell: it never does."""
+        """Whether it needs no cell: it never does."""
         return True
 
     @property
@@ -109,7 +110,7 @@ class PassingVehicle:
         return False
 
     @property
-    def starts(self) -> bool:
+    def re_enters(self) -> bool:
         """Whether it is on its way into a cell: it never is."""
         return False
 

@@ -224,7 +224,7 @@ class Roadside:
             for vehicle in vehicles.values():
                 vehicle.close(self.lane_ends)
             control.close(self.lane_ends, closed)
-        control.over = obstacles.over(t_s)
+        control.still_closed = obstacles.still_closed(t_s)
         self.publisher.obstacles, self.publisher.cleared = obstacles.parts, obstacles.cleared
         for vehicle in broken:
             yield control.take_off(vehicle.name, vehicle)

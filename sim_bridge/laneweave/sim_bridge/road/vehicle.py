@@ -132,7 +132,7 @@ class RoadVehicle:
         return not self.has_cell and self.controller.broken_mps2 is None
 
     @property
-    def starts(self) -> bool:
+    def re_enters(self) -> bool:
         """Whether it has waited, and is on its way into a cell."""
         return self.controller.off_lattice is OffLatticePhase.RE_ENTERING
 

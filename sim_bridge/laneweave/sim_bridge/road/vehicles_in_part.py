@@ -44,7 +44,7 @@ class BodyOnRoad(Protocol):
         """Whether it waits for a lane to be open again."""
 
     @property
-    def starts(self) -> bool:
+    def re_enters(self) -> bool:
         """Whether it has waited, and is on its way into a cell."""
 
 
@@ -100,7 +100,7 @@ def vehicles_in_part(
             continue
         if s_m >= from_m:
             inside.append(vehicle.name)
-        elif (vehicle.starts and vehicle.stops_m >= first_m) or (
+        elif (vehicle.re_enters and vehicle.stops_m >= first_m) or (
             not vehicle.has_cell and from_m - s_m < room_m
         ):
             near.append(vehicle.name)  # it would drive into the part

@@ -264,6 +264,12 @@ def test_a_vehicle_that_has_broken_down(tmp_path: Path) -> None:
     found = explained(tmp_path, [LEADER, ENTERED, STOPS, *parts, *OLD_OFF])
     assert found.reason == Reason.BROKE_DOWN
     assert found.text.endswith("it broke down at 30.0 s, in lane 1")
+    again = at(45.0, "entered-lattice", vehicle=V, lane=1)
+    later = at(50.0, "missed-exit", vehicle=V, lane=1)
+    other = [part("closed", 5.0, from_m=50.0, to_m=70.0, **OPERATOR), *parts]
+    driving = explained(tmp_path, [LEADER, ENTERED, STOPS, *other, again, later, *OLD_OFF])
+    assert driving.reason == Reason.MISSED_EXIT
+    assert not [line for line in driving.story if line.text.startswith("stops")]
     told = [line.text for line in found.story if 20.0 < line.t_s < 50.0]
     assert told == ["breaks down in lane 1", "lane 1 open again from 500 m on"]
 
@@ -272,7 +278,7 @@ def test_a_plan_that_a_closed_part_kept_from_being_completed(tmp_path: Path) -> 
     planned = [LEADER, ENTERED, CLOSED, PLAN, IN_FORCE]
     found = explained(tmp_path, [*planned, part("closed", 20.0), *OFF])
     assert found.reason == Reason.CLOSED_PART
-    assert "not completed it because of lane 1, closed" in found.text
+    assert "not completed it in the time of lane 1, closed" in found.text
     assert explained(tmp_path, [*planned, *OFF]).reason == Reason.NOT_COMPLETED
 
 

@@ -7,16 +7,18 @@ from random import Random
 import pytest
 from attrs import evolve
 
+from laneweave.protocol.road_layout import end_exit
+from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.road_tables import Demand, RoadEvent
 from laneweave.sim_bridge.road.obstacles import Breakdown
 from support import road_bugs
 from support.bugs import Bug, catches
-from support.closed_lanes import LonelyRoad, road_with
+from support.closed_lanes import DROP, LonelyRoad, road_with
 from support.variants import variants
 
 ROAD = road_with(s3_m=850.0)
 END_S = 1500.0
-"""Everybody has left long before."""
+"""All vehicles have left long before."""
 
 
 def drawn_event(random: Random, lane: int) -> RoadEvent:
@@ -50,15 +52,20 @@ def drawn_breakdown(random: Random, lane: int) -> Breakdown:
     )
 
 
-def drawn_road(seed: int) -> LonelyRoad:
+def drawn_road(seed: int, scenario: Scenario = ROAD) -> LonelyRoad:
     random = Random(seed)
     lane = random.randrange(3)
-    events = tuple(drawn_event(random, lane) for _ in range(random.randrange(1, 4)))
+    drawn_events = [drawn_event(random, lane) for _ in range(random.randrange(1, 4))]
+    # Vehicles of other systems do not change lanes.
+    sections = scenario.geometry.sections
+    to_end = {one.lane for one in sections if one.exit == end_exit(one.lane)}
+    events = tuple(one for one in drawn_events if not one.speed_mps or one.lane in to_end)
     breakdowns = [drawn_breakdown(random, lane) for _ in range(random.randrange(1, 4))]
     volume = random.choice([200.0, 600.0, 1000.0, 1500.0])
     demand = Demand(volume_veh_per_lane_h=volume, duration_s=60.0)
-    road = evolve(ROAD.road, events=events)
-    return LonelyRoad(evolve(ROAD, demand=demand, seed=seed % 7, road=road), tuple(breakdowns))
+    road = evolve(scenario.road, events=events)
+    drawn = evolve(scenario, demand=demand, seed=seed % 7, road=road)
+    return LonelyRoad(drawn, tuple(breakdowns))
 
 
 FOUND = (
@@ -94,8 +101,16 @@ FOUND = (
         *(pytest.param(seed, marks=pytest.mark.full) for seed in range(1000, 1300)),
     ],
 )
-def test_nobody_touches_anybody_or_is_in_a_closed_part_and_all_leave(seed: int) -> None:
+def test_bodies_do_not_touch_none_is_in_a_closed_part_and_all_leave(seed: int) -> None:
     run_to_end(drawn_road(seed))
+
+
+@pytest.mark.parametrize(
+    "seed",
+    [*variants(range(7), 1), *(pytest.param(n, marks=pytest.mark.full) for n in range(7, 300))],
+)
+def test_the_same_before_the_end_of_a_lane(seed: int) -> None:
+    run_to_end(drawn_road(seed, DROP))
 
 
 @pytest.mark.more
