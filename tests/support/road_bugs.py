@@ -11,7 +11,7 @@ from msgspec.structs import replace
 
 from laneweave.agents.core import AgentCore
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.road_layout import Exits, LanePosition, TemporaryClosure
+from laneweave.protocol.road_layout import Exits, TemporaryClosure
 from laneweave.protocol.scenario.vehicle_types import VehicleTypes
 from laneweave.protocol.vehicle.lane_end import LaneEnd, ReEntry
 from laneweave.protocol.vehicle.lane_ends import LaneEnds
@@ -265,14 +265,6 @@ def entrances_stay_open(*_: object) -> None:
 @breaks(OBSTACLES, RoadVehicle, "close")
 def controllers_do_not_know(*_: object) -> None:
     """Motion controllers do not learn which parts are closed."""
-
-
-@breaks(OBSTACLES, LaneEndControl, "_starts_in_own_lane")
-def vehicles_start_before_the_next_dead_end(
-    _starts: Call, self: LaneEndControl, at: LanePosition, vehicle: RoadVehicle
-) -> bool:
-    """A vehicle starts in its own lane although another part of it is closed ahead."""
-    return self._is_open(at, vehicle)
 
 
 @breaks(OBSTACLES)
