@@ -250,7 +250,9 @@ def test_several_vehicles_break_down_at_once() -> None:
     for breakdowns in ((twice, twice), drawn):
         changes = run_to_end(lonely_road(*breakdowns, volume=1000.0))
         begun = [one.vehicle for _, kind, one in changes if kind == PART_OPENED]
-        assert len(begun) == len(set(begun)) == len(breakdowns)
+        assert len(begun) == len(breakdowns)
+        # The first vehicle beyond a place may be one that has been repaired there.
+        assert breakdowns is not drawn or len(begun) == len(set(begun))
 
 
 def test_where_vehicles_enter_none_breaks_down_that_others_could_not_see_in_time() -> None:
