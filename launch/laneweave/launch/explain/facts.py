@@ -8,6 +8,7 @@ from typing import Any
 
 from attrs import define, field
 
+from laneweave.launch.recordings.closed_parts import ClosedPart, ClosedParts
 from laneweave.protocol.road_layout import ANY_LANE
 from laneweave.protocol.wire import events as kinds
 
@@ -67,21 +68,6 @@ class Absence:
 
 
 @define
-class ClosedPart:
-    """A part of a lane that was closed for a time, or a vehicle of another system there."""
-
-    first: Event
-    """The event `part-closed` with which it began."""
-    newest: Event
-    """The newest one, which may know better where the part ends."""
-    until_s: float = math.inf
-
-    def meets(self, since_s: float, until_s: float) -> bool:
-        """Return whether it was closed at some time from one road time to another."""
-        return float(self.first["t_s"]) <= until_s and since_s <= self.until_s
-
-
-@define
 class Facts:
     """Facts about a vehicle, up to its departure or the end of the recording."""
 
@@ -138,8 +124,8 @@ class Facts:
     """The last time without an agent of every vehicle that has had one."""
     never_attended: bool = False
     """Whether its agent did not start in time."""
-    closed_parts: list[ClosedPart] = field(factory=list)
-    """Those that had begun when the facts end."""
+    closed: ClosedParts = field(factory=ClosedParts)
+    """The closed parts that had begun when the facts end."""
     refused: list[Event] = field(factory=list)
     """Processes whose settings were refused."""
     leader_gaps: list[tuple[float, float]] = field(factory=list)
@@ -152,8 +138,8 @@ class Facts:
     @property
     def breakdown(self) -> ClosedPart | None:
         """Its own breakdown, if it has had one: the newest."""
-        own = (one for one in self.closed_parts if one.first.get("vehicle") == self.vehicle)
-        return max(own, key=lambda one: float(one.first["t_s"]), default=None)
+        newest_first = reversed(self.closed.parts)
+        return next((one for one in newest_first if self._is_own(one)), None)
 
     def closed_between(self, since_s: float, until_s: float) -> list[ClosedPart]:
         """Return the parts that were closed in lanes that it had or wanted, in some time."""
@@ -166,7 +152,7 @@ class Facts:
         ]
         return [
             one
-            for one in self.closed_parts
+            for one in self.closed.parts
             if lanes
             and min(lanes) <= one.first["lane"] <= max(lanes)
             and one.meets(since_s, until_s)
@@ -177,17 +163,16 @@ class Facts:
         t_s = float(event["t_s"])
         found = [
             one
-            for one in self.closed_parts
+            for one in self.closed.parts
             if one.first["lane"] == event["lane"] and one.meets(t_s, t_s)
         ]
-        own = (one for one in found if self._breaks_down(one, t_s))
-        others = (one for one in reversed(found) if one.first.get("vehicle") != self.vehicle)
+        own = (one for one in found if self._is_own(one) and one.since_s == t_s)
+        others = (one for one in reversed(found) if not self._is_own(one))
         return next(own, next(others, None))
 
-    def _breaks_down(self, part: ClosedPart, t_s: float) -> bool:
-        """Return whether a part begins with its own breakdown at a road time."""
-        first = part.first
-        return first.get("vehicle") == self.vehicle and float(first["t_s"]) == t_s
+    def _is_own(self, part: ClosedPart) -> bool:
+        """Return whether a part is closed because the vehicle itself has broken down."""
+        return part.first.get("vehicle") == self.vehicle
 
     @property
     def absence(self) -> Absence | None:
@@ -283,33 +268,15 @@ def _is_around(vehicle: str, event: Event) -> bool:
 
 
 def _add_part(facts: Facts, event: Event) -> None:
-    at = _part_of(event)
-    active = (one for one in facts.closed_parts if math.isinf(one.until_s))
-    known = next((one for one in active if _part_of(one.first) == at), None)
-    if event["kind"] == kinds.PART_OPENED:
-        if known is None:
-            return
-        known.until_s = float(event["t_s"])
-    elif known is not None:
-        known.newest = event
-        return
-    else:
-        facts.closed_parts.append(ClosedPart(event, event))
-    if facts.entered is not None:
+    if facts.closed.add(event) and facts.entered is not None:
         facts.events.append(event)
-
-
-def _part_of(event: Event) -> tuple[object, ...]:
-    """Return what identifies a part while it is closed."""
-    return tuple(event.get(key) for key in ("lane", "cause", "vehicle", "from_m"))
 
 
 def _add_own(facts: Facts, event: Event) -> None:
     match event["kind"]:
         case kinds.ENTERED:
             facts.entered = event
-            active = (one for one in facts.closed_parts if math.isinf(one.until_s))
-            facts.events += [one.first for one in active]
+            facts.events += [one.first for one in facts.closed.active]
         case kinds.LEFT:
             facts.left = event
         case kinds.LEFT_OFF_LANE:

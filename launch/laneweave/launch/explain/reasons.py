@@ -13,7 +13,7 @@ from enum import StrEnum
 from attrs import frozen
 
 from laneweave.launch.explain.facts import Absence, Facts
-from laneweave.launch.explain.story import ABSENCE, closed_part, names, seconds
+from laneweave.launch.explain.story import ABSENCE, described, names, seconds
 from laneweave.protocol.wire import events as kinds
 from laneweave.protocol.wire import reasons
 
@@ -95,7 +95,7 @@ def reason_of(facts: Facts) -> Finding:
         text = f"it began its move to or from the exit lane too late {at}, in lane {end['lane']}"
         reason = Reason.MISSED_EXIT
     elif part is not None:
-        text, reason = f"it stopped {at} before {closed_part(part)}", Reason.CLOSED_PART
+        text, reason = f"it stopped {at} before {described(part)}", Reason.CLOSED_PART
     else:
         text = f"it stopped before the end of lane {end['lane']} {at}"
         reason = Reason.STOPPED
@@ -177,7 +177,7 @@ def _unreached(facts: Facts) -> Finding | None:
     no_path = f"{planned} had no path to its lane"
     parts = facts.closed_between(event["t_s"], event["t_s"])
     if parts:
-        return Finding(Reason.CLOSED_PART, f"{no_path} because of {closed_part(parts[-1])}")
+        return Finding(Reason.CLOSED_PART, f"{no_path} because of {described(parts[-1])}")
     return Finding(Reason.NO_ROOM, no_path)
 
 
@@ -189,7 +189,7 @@ def _closed(facts: Facts) -> Finding | None:
     parts = facts.closed_between(planned_s, facts.end_s)
     if not parts:
         return None
-    text = f"it had a plan, but has not completed it in the time of {closed_part(parts[-1])}"
+    text = f"it had a plan, but has not completed it in the time of {described(parts[-1])}"
     return Finding(Reason.CLOSED_PART, text)
 
 

@@ -8,7 +8,8 @@ from typing import Any
 
 from attrs import frozen
 
-from laneweave.launch.explain.facts import LEADER_LOST, ClosedPart, Event, Facts
+from laneweave.launch.explain.facts import LEADER_LOST, Event, Facts
+from laneweave.launch.recordings.closed_parts import ClosedPart
 from laneweave.protocol.names import first_names
 from laneweave.protocol.road_layout import ANY_LANE, END_OF_ROAD
 from laneweave.protocol.wire import events as kinds
@@ -140,21 +141,18 @@ def _stops(facts: Facts, event: Event) -> str:
         return f"stops before the end of lane {event['lane']}"
     if part.first.get("vehicle") == facts.vehicle:
         return ""  # it is the part
-    return f"stops before {closed_part(part)}"
+    return f"stops before {described(part)}"
 
 
-def closed_part(part: ClosedPart) -> str:
-    """Return a part of a lane that was closed, and why, as a noun."""
+def described(part: ClosedPart) -> str:
+    """Return a description of a closed part and of its cause."""
     event = part.newest
     lane, vehicle = event["lane"], event.get("vehicle")
     if event.get("cause") == obstacle_messages.PASSING:
         return f"{vehicle}, a vehicle of another system, in lane {lane}"
     where = f"lane {lane}, closed from {event['from_m']:.0f} to {event['to_m']:.0f} m"
-    return (
-        f"{where} ({vehicle} had broken down)"
-        if event.get("cause") == obstacle_messages.BREAKDOWN
-        else where
-    )
+    broken = event.get("cause") == obstacle_messages.BREAKDOWN
+    return f"{where} ({vehicle} had broken down)" if broken else where
 
 
 def _part_closed(event: Event) -> str:

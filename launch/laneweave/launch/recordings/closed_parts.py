@@ -3,13 +3,68 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
-from attrs import frozen
+from attrs import define, field, frozen
 
 from laneweave.launch.recordings.formations import read_events
 from laneweave.protocol.wire.events import PART_CLOSED, PART_OPENED
 from laneweave.protocol.wire.obstacle_messages import PASSING
+
+Event = Mapping[str, Any]
+
+
+@define
+class ClosedPart:
+    """A part of a lane that was closed for a time, or a vehicle of another system there."""
+
+    first: Event
+    """The event `part-closed` with which it began."""
+    newest: Event
+    """The newest one, which may know better where the part ends."""
+    until_s: float = math.inf
+    """Infinite: it was not opened again."""
+
+    @property
+    def since_s(self) -> float:
+        """Road time at which it was closed."""
+        return float(self.first["t_s"])
+
+    def meets(self, since_s: float, until_s: float) -> bool:
+        """Return whether it was closed at some time from one road time to another."""
+        return self.since_s <= until_s and since_s <= self.until_s
+
+
+@define
+class ClosedParts:
+    """All parts of a run, in the order in which they began."""
+
+    parts: list[ClosedPart] = field(factory=list)
+
+    @property
+    def active(self) -> Iterator[ClosedPart]:
+        """Those that are closed when the events end."""
+        return (one for one in self.parts if math.isinf(one.until_s))
+
+    def add(self, event: Event) -> bool:
+        """Add an event `part-closed` or `part-opened`; return whether a part begins or ends."""
+        known = next((one for one in self.active if _key(one.first) == _key(event)), None)
+        opens: bool = event["kind"] == PART_OPENED
+        if known is not None:
+            known.newest = event
+            if opens:
+                known.until_s = float(event["t_s"])
+            return opens
+        if not opens:
+            self.parts.append(ClosedPart(event, event))
+        return not opens
+
+
+def _key(event: Event) -> tuple[object, ...]:
+    """Return what identifies a part while it is closed."""
+    return tuple(event.get(key) for key in ("lane", "cause", "vehicle", "from_m"))
 
 
 @frozen
@@ -30,18 +85,17 @@ def closed_for_a_time(folder: Path) -> list[ClosedForATime]:
     Raises:
         OSError, ValueError, KeyError, TypeError: the events cannot be read.
     """
-    found: dict[tuple[int, float], ClosedForATime] = {}
-    ended: list[ClosedForATime] = []
+    closed = ClosedParts()
     for event in read_events(folder, PART_CLOSED, PART_OPENED):
-        if event.get("cause") == PASSING:
-            continue
-        at, t_s = (int(event["lane"]), float(event["from_m"])), float(event["t_s"])
-        before = found.pop(at, None)
-        since_s = t_s if before is None else before.since_s
-        until_s = t_s if event["kind"] == PART_OPENED else math.inf
-        one = ClosedForATime(*at, float(event["to_m"]), since_s, until_s)
-        if math.isinf(until_s):
-            found[at] = one
-        else:
-            ended.append(one)
-    return [*ended, *found.values()]
+        if event.get("cause") != PASSING:
+            closed.add(event)
+    return [
+        ClosedForATime(
+            int(one.first["lane"]),
+            float(one.first["from_m"]),
+            float(one.newest["to_m"]),
+            one.since_s,
+            one.until_s,
+        )
+        for one in closed.parts
+    ]

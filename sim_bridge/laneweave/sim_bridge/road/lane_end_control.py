@@ -95,7 +95,7 @@ class LaneEndControl:
         self._columns, self._distance_m, self._room_m = 0, 0.0, 0.0
         self._gaps: dict[LanePosition, list[Gap]] = {}
         self.still_closed: Sequence[TemporaryClosure] = ()
-        """Parts that are closed for a time and are not over."""
+        """Parts that are closed for a time, and whose cause lasts."""
         self._last_gap_column: dict[int, float] = {}
         """Rearmost column of the last gap, by entry point."""
         self._entered_gaps: list[range] = []
@@ -227,9 +227,9 @@ class LaneEndControl:
             gaps.append(Gap(lane, columns))
 
     def _is_open(self, at: LanePosition, vehicle: RoadVehicle) -> bool:
-        """Return whether nothing is closed any more at a dead end ahead of a vehicle.
+        """Return whether a vehicle can drive on in its lane, beyond a dead end.
 
-        Its cause is over, or the body is beyond what is closed there.
+        The causes of all that is closed there are over, or its body is beyond.
         """
         end, s_m = self._ends[at], vehicle.state[0]
         return s_m >= end.reopens_m or (
@@ -265,28 +265,30 @@ class LaneEndControl:
         end, s_m = self._ends[at], vehicle.state[0]
         if end.taken_back:
             return None
-        at_m = min(s_m, end.line_m)
-        if s_m > end.line_m + NEAR_LINE_M:
-            needed_m = s_m + self._room_m
-            if not self._is_open(at, vehicle) or any(
-                other.end_m < needed_m for other in self._later(at, vehicle)
-            ):
+        if not self._is_before_line(at, vehicle):
+            room_m = min((one.end_m for one in self._later(at, vehicle)), default=math.inf) - s_m
+            if room_m < self._room_m or not self._is_open(at, vehicle):
                 return None
-            at_m = s_m
-        elif not vehicle.controller.stays:
-            at_m = end.line_m  # it drives up to the line
-        return lane_beside(self._scenario, end.lane, at_m, self._sections)
+            starts_m = s_m
+        else:
+            # Without a part that is closed for a time, it drives up to the line.
+            starts_m = min(s_m, end.line_m) if vehicle.controller.stays else end.line_m
+        return lane_beside(self._scenario, end.lane, starts_m, self._sections)
+
+    def _is_before_line(self, at: LanePosition, vehicle: RoadVehicle) -> bool:
+        """Return whether a vehicle waits at the stop line before a dead end, or before it."""
+        return vehicle.state[0] <= self._ends[at].line_m + NEAR_LINE_M
 
     def _may_start(self, at: LanePosition, vehicle: RoadVehicle) -> bool:
         """Return whether a vehicle has room to start from where it waits."""
         return (
-            vehicle.state[0] <= self._ends[at].line_m + NEAR_LINE_M
+            self._is_before_line(at, vehicle)
             or self._starts_in_own_lane(at, vehicle)
             or self._beside(at, vehicle) is not None
         )
 
     def _may_take(self, gap: Gap, at: LanePosition, vehicle: RoadVehicle) -> bool:
-        """Return whether a gap can be for a vehicle, as its lane and the one beside it are now."""
+        """Return whether a vehicle can start into a gap from where it waits now."""
         if gap.lane == at[0]:
             return self._starts_in_own_lane(at, vehicle)
         return gap.lane == self._beside(at, vehicle)

@@ -95,23 +95,23 @@ class PassingVehicle:
 
     @property
     def stops_m(self) -> float:
-        """Where it can stop if it has not expected to."""
+        """Position at which it stops if it begins to brake after its reaction time."""
         reacts_m = self.speed_mps * REACTION_S
         return self.s_m + MIN_GAP_M + reacts_m + self.speed_mps**2 / (2.0 * HARDEST_MPS2)
 
     @property
     def has_cell(self) -> bool:
-        """Whether it needs no cell: it never does."""
+        """Whether it is on the lattice or needs no cell: always."""
         return True
 
     @property
     def waits(self) -> bool:
-        """Whether it waits for a lane to be open again: it never does."""
+        """Whether it waits for a lane to be open again: never."""
         return False
 
     @property
     def re_enters(self) -> bool:
-        """Whether it is on its way into a cell: it never is."""
+        """Whether it drives back into a cell: never, since it needs none."""
         return False
 
     @property
@@ -276,7 +276,7 @@ class PassingVehicles:
         closed: Iterable[TemporaryClosure],
         t_s: float,
     ) -> bool:
-        """Return whether a vehicle can enter: nobody has to brake hard for it, nor it for others.
+        """Return whether a vehicle can enter so that neither it nor others have to brake hard.
 
         Not even if the vehicle ahead stops suddenly.
         """

@@ -100,12 +100,12 @@ class RoadVehicle:
 
     @property
     def lanes_touched(self) -> range:
-        """Lanes in which parts of the body are, which is turned while it changes lanes."""
+        """Lanes in which corners of the body are, with its heading."""
         lattice = self.controller.lattice
         ys_m = [y_m for _, y_m in corners(pose_of(self.state), *self.size)]
-        first, last = min(ys_m), max(ys_m)
-        touched = lattice.lanes_touched(0.5 * (first + last), last - first)
-        return range(touched[0], touched[1] + 1)
+        right_m, left_m = min(ys_m), max(ys_m)
+        first, last = lattice.lanes_touched(0.5 * (right_m + left_m), left_m - right_m)
+        return range(first, last + 1)
 
     @property
     def lanes_used(self) -> set[int]:
@@ -119,9 +119,9 @@ class RoadVehicle:
 
     @property
     def stops_m(self) -> float:
-        """Where it can stop if it has not expected to.
+        """Position at which it stops if it begins to brake after its reaction time.
 
-        After it has started in a part that is open again, it stops only beyond that.
+        After it has started in a part that is open again, it stops only beyond that part.
         """
         s_m, speed_mps = self.state[:2]
         return self.controller.stop_lines.section_m(self.body_lane, s_m) + stopping_m(speed_mps)

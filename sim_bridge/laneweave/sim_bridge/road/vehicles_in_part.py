@@ -37,7 +37,7 @@ class BodyOnRoad(Protocol):
 
     @property
     def stops_m(self) -> float:
-        """Where it can stop if it has not expected to."""
+        """Position at which it stops if it begins to brake after its reaction time."""
 
     @property
     def waits(self) -> bool:

@@ -246,7 +246,7 @@ def test_a_closed_part_is_the_reason_while_it_is_closed(
 
 def test_a_vehicle_that_stops_before_a_closed_part(tmp_path: Path) -> None:
     grown = part("closed", 27.0, to_m=560.0)
-    parts = [part("closed", 20.0), grown, part("opened", 40.0)]
+    parts = [part("closed", 20.0), grown, part("opened", 40.0, to_m=560.0)]
     found = explained(tmp_path, [LEADER, ENTERED, STOPS, *parts, *OLD_OFF])
     where = "lane 1, closed from 500 to 560 m (v0002 had broken down)"
     assert found.reason == Reason.CLOSED_PART

@@ -246,13 +246,14 @@ def test_a_single_vehicle_stops_before_a_part_that_is_closed_ahead_of_it(ahead_m
 @pytest.mark.more
 def test_several_vehicles_break_down_at_once() -> None:
     twice = evolve(BREAKS_DOWN, for_s=10.0)
+    both_lanes = twice, evolve(twice, lane=0)
     drawn = [Breakdown(AT_S, draw=each / 10.0, for_s=10.0) for each in range(10)]
-    for breakdowns in ((twice, twice), drawn):
+    for breakdowns in ((twice, twice), both_lanes, drawn):
         changes = run_to_end(lonely_road(*breakdowns, volume=1000.0))
         begun = [one.vehicle for _, kind, one in changes if kind == PART_OPENED]
         assert len(begun) == len(breakdowns)
         # The first vehicle beyond a place may be one that has been repaired there.
-        assert breakdowns is not drawn or len(begun) == len(set(begun))
+        assert breakdowns == (twice, twice) or len(begun) == len(set(begun))
 
 
 def test_where_vehicles_enter_none_breaks_down_that_others_could_not_see_in_time() -> None:

@@ -22,7 +22,7 @@ END_S = 1500.0
 
 
 def drawn_event(random: Random, lane: int) -> RoadEvent:
-    """Return a slow vehicle, a fast one or a part that is closed."""
+    """Return an event of the road: a slow vehicle, a fast one or a closed part."""
     lane = lane if random.random() < 0.8 else random.randrange(3)
     length_m, kind = random.uniform(3.0, 12.0), random.random()
     first_m, last_m = (
@@ -91,7 +91,7 @@ FOUND = (
     338,
     459,
 )
-"""Seeds that found vehicles in closed parts, or vehicles that waited for ever."""
+"""Seeds at which vehicles were in closed parts or waited for ever, before this was mended."""
 
 
 @pytest.mark.parametrize(

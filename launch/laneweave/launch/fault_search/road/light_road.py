@@ -35,8 +35,8 @@ from laneweave.sim_bridge.simulated_road import SimulatedRoad
 RE_ENTRY_S = 8.0
 """Time in which a vehicle drives from standing into its cell."""
 
-BEHIND_M = 1.0
-"""How far the rear of a body that drives into a short part is behind its beginning, at first."""
+TOUCH_M = 0.1
+"""How far a body may reach into a closed part."""
 
 
 class Reception(Enum):
@@ -291,12 +291,14 @@ class LightRoad:
                 continue  # those that have waited start there
             lane, from_m, to_m, _ = one.part
             # In the short slots of the fault search, a body that falls back a column moves
-            # backwards on the road, with its rear up to where a short part begins.
-            to_m = max(to_m - self._scenario.lattice.pitch_m, from_m - BEHIND_M)
+            # backwards on the road, perhaps past all of a short part.
+            back_m = to_m - self._scenario.lattice.pitch_m
+            to_m = max(back_m, from_m + TOUCH_M)
             inside = {
                 vehicle.name
                 for vehicle in on_lattice
-                if lane in vehicle.lanes_used and _is_beside(vehicle, from_m, to_m)
+                if lane in vehicle.lanes_used
+                and _is_beside(vehicle, from_m, back_m if vehicle.body.falls_back else to_m)
             }
             # Those that were inside when the part was closed drive out of it.
             known = self._inside.setdefault(
@@ -304,7 +306,7 @@ class LightRoad:
             )
             for name in sorted(inside - known):
                 if lane in self.vehicles[name].lanes_touched:
-                    text = f"in lane {lane}, which is closed from {from_m:g} m on"
+                    text = f"in lane {lane}, which is closed from {from_m:g} to {to_m:g} m"
                     self._checker.beyond_end(now_s, name, text)
 
     def _check_change(self, vehicle: LightVehicle, held: Cell, now_s: float) -> None:

@@ -58,7 +58,7 @@ class LightBody(Plant):
         self.t_s = t_s
         """Time of the newest tick."""
         self._leaves_s = leaves_s
-        self._lattice = scenario.lattice
+        self._lattice, self._slot_s = scenario.lattice, scenario.timing.cycles_s[0]
         self._origin: tuple[float, float] = cell
         self._goal: Cell = cell
         self._begin_s = self._end_s = 0.0
@@ -97,6 +97,12 @@ class LightBody(Plant):
     def has_arrived(self, now_s: float) -> bool:
         """Return whether the body is in the centre of its target cell."""
         return now_s >= self._end_s
+
+    @property
+    def falls_back(self) -> bool:
+        """Whether its newest motion leads to a column behind, and has ended a slot ago at most."""
+        recent = self.t_s <= self._end_s + self._slot_s
+        return recent and self._goal[0] < self._origin[0]
 
     def _place(self, t_s: float) -> tuple[float, float]:
         if t_s >= self._end_s:
