@@ -18,6 +18,10 @@ from laneweave.protocol.runtime import processes as p
 def send(*numbers):
     for number in numbers:
         os.kill(os.getpid(), number)
+def wait_for_signal():
+    # A signal just before one long sleep would be handled only after it.
+    for _ in range(6000):
+        time.sleep(0.01)
 HUP, TERM, INT, USR1 = signal.SIGHUP, signal.SIGTERM, signal.SIGINT, signal.SIGUSR1
 {body}
 """
@@ -74,7 +78,7 @@ p.raise_interrupts(TERM)
 try:
     Finalized()
     print("discarded")
-    time.sleep(60)
+    wait_for_signal()
 except KeyboardInterrupt:
     print("interrupted")
 time.sleep(0.1)
@@ -110,7 +114,7 @@ def test_output_to_a_closed_terminal_is_discarded() -> None:
 p.raise_interrupts(HUP)
 try:
     print("ready", flush=True)
-    time.sleep(60)
+    wait_for_signal()
 except KeyboardInterrupt:
     print("into the void", flush=True)
 print("errors are redirected", file=sys.stderr)
@@ -140,7 +144,7 @@ if os.fork() == 0:
         signal.signal(USR1, lambda *_: (os.write(writer, b"x"), os._exit(0)))
         p.die_with_parent(number=USR1)
         os.write(writer, b"r")
-        time.sleep(60)
+        wait_for_signal()
     os.read(reader, 1)
     os._exit(0)
 time.sleep(0.2)
