@@ -27,7 +27,7 @@ from laneweave.coordinator.formations.roster import (
     steps_left,
 )
 from laneweave.coordinator.formations.sorting import Sorting, SortingTask, sort_lanes
-from laneweave.coordinator.formations.stages import Stage, stages
+from laneweave.coordinator.formations.stages import Stage
 from laneweave.coordinator.operation import LogEntry
 from laneweave.coordinator.planning.budget import Clock
 from laneweave.coordinator.planning.paper.assignments import Weights
@@ -154,17 +154,16 @@ class FormationPlanner:
         lanes, possible = range(scenario.road.lanes), leader.hold_cells.values()
         cells = [cell for cell in possible if block_of(cell[0]) in numbers and cell[1] in lanes]
         cells = cells or self._block_cells(numbers)
-        of_road = stages(scenario)
-        stage, is_last = of_road[formation.stage], formation.stage == len(of_road) - 1
+        stage, is_last = formation.stage, formation.stage.is_last
         start_s = self._start_s(formation, cells, t_s)
         soonest_s = start_s + scenario.timing.cycles_s[0]
-        stage_s = stage_end_s(numbers, formation.stage, scenario)
+        stage_s = stage_end_s(numbers, stage, scenario)
         ends_s = {} if is_last else self._ends_s(leader)
         too_late = frozenset(name for name, each_s in ends_s.items() if each_s < soonest_s)
         end_s = min([stage_s, *(each_s for each_s in ends_s.values() if each_s >= soonest_s)])
         if not is_last and (end_s < soonest_s or (too_late and len(too_late) == len(ends_s))):
             if not leader.failures:
-                data = {"formation": numbers[0], "stage": formation.stage}
+                data = {"formation": numbers[0], "stage": stage.number}
                 yield LogEntry(STRUCTURE_TOO_LATE, data)
             leader.take(FAILED, now_s)
             return
@@ -294,8 +293,7 @@ class FormationPlanner:
                 if not problems:
                     leader.on_plan(plan, now_s, result.out_of_reach)
                     pauses = steps_of(plan) - steps_of(planned)
-                    stage = stages(self._scenario)[leader.formation.stage]
-                    yield from _log_entries(leader.formation, stage, result, pauses, plan)
+                    yield from _log_entries(leader.formation, result, pauses, plan)
                     return
                 error = "; ".join(problems)
         leader.take(FAILED, now_s)
@@ -311,15 +309,14 @@ class FormationPlanner:
             if leader.formation.joined + other.formation.joined > max_joined:
                 continue
             union = (*numbers, *other.formation.numbers)
-            if self._steps_left_in(union, leader.formation.stage, t_s) > 0:
+            if self.steps_left_in(union, leader.formation.stage, t_s) > 0:
                 return self._groups.join(union)
         return False
 
-    def _steps_left_in(self, numbers: Numbers, stage: int, t_s: float) -> int:
+    def steps_left_in(self, numbers: Numbers, stage: Stage, t_s: float) -> int:
         """Return the number of steps left in a stage for vehicles anywhere in these blocks."""
         cells, scenario = self._block_cells(tuple(sorted(numbers))), self._scenario
-        from_m = stages(scenario)[stage].from_m
-        start_s = sorting_start_s(cells, t_s + START_MARGIN_S, scenario, from_m)
+        start_s = sorting_start_s(cells, t_s + START_MARGIN_S, scenario, stage.from_m)
         end_s = moves_end_s(cells, tuple(sorted(numbers)), stage, scenario)
         return int((end_s - start_s) / scenario.timing.cycles_s[0] + 1e-6)
 
@@ -356,11 +353,11 @@ class FormationPlanner:
         if not formation.sorts:
             end_s = stage_end_s(formation.numbers, formation.stage, scenario)
             return paced(plan, others, plan.t0_s, end_s, scenario)
-        stage = stages(scenario)[formation.stage]
+        stage = formation.stage
         moved = {cell for moves in plan.moves.values() for _, *each in moves for cell in each}
-        if stage is stages(scenario)[-1] or not moved:
+        if stage.is_last or not moved:
             moved = {*cells, *plan.territory}
-        end_s = moves_end_s(moved, formation.numbers, formation.stage, scenario)
+        end_s = moves_end_s(moved, formation.numbers, stage, scenario)
         not_before_s = max(settled_s(cells, scenario), t_s + START_MARGIN_S)
         return paced(plan, others, not_before_s, end_s, scenario, stage.from_m)
 
@@ -381,18 +378,17 @@ class FormationPlanner:
         """Return the earliest road time at which a formation may begin to move."""
         scenario, not_before_s = self._scenario, t_s + START_MARGIN_S
         if formation.sorts:
-            from_m = stages(scenario)[formation.stage].from_m
-            return sorting_start_s(cells, not_before_s, scenario, from_m)
+            return sorting_start_s(cells, not_before_s, scenario, formation.stage.from_m)
         begin_s = stage_begin_s(formation.numbers, formation.stage, scenario)
         return on_tick(max(begin_s, settled_s(cells, scenario), not_before_s), scenario)
 
 
 def _log_entries(
-    formation: Formation, stage: Stage, sorting: Sorting, pauses: int, plan: Plan
+    formation: Formation, sorting: Sorting, pauses: int, plan: Plan
 ) -> Iterator[LogEntry]:
-    number = formation.numbers[0]
+    number, stage = formation.numbers[0], formation.stage
     if sorting.impossible:
-        data = {"formation": number, "stage": formation.stage, "why": sorting.impossible}
+        data = {"formation": number, "stage": stage.number, "why": sorting.impossible}
         yield LogEntry(STRUCTURE_IMPOSSIBLE, data)
     if (response := sorting.response) is not None:
         data = {"formation": number, "vehicles": len(response.paths)}

@@ -5,13 +5,15 @@ from __future__ import annotations
 import random
 from collections.abc import Callable, Iterator
 
+from attrs import evolve
+
 from laneweave.coordinator.ballots.ballot_round import PROMISED, TIME, BallotPhase
 from laneweave.coordinator.formations.formation_planner import FormationPlanner
 from laneweave.coordinator.formations.leader import FormationLeader
 from laneweave.coordinator.formations.roster import Formation, Groups, closed_formations, joinable
 from laneweave.coordinator.operation import LogEntry, to_vehicle
 from laneweave.coordinator.planning.response import PlanFunction
-from laneweave.protocol.road_layout import TemporaryParts
+from laneweave.protocol.road_layout import TemporaryClosure, TemporaryParts
 from laneweave.protocol.runtime.node import Compute, Computed, Effect
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.state_machine import RuleBook
@@ -55,11 +57,13 @@ class FormationsOperation:
         self._rng = rng
         self._rules = rules
         self._groups = Groups()
+        self._closed: tuple[TemporaryClosure, ...] = ()
         self._planner = FormationPlanner(scenario, self._groups, self.leaders, new_job, plan)
 
     def forget(self) -> None:
         """Discard all formations and all joins."""
         self._groups.forget()
+        self._closed = ()
         self.take_over()
 
     def take_over(self) -> None:
@@ -68,7 +72,10 @@ class FormationsOperation:
         self._planner.forget()
 
     def on_obstacles(self, temporary: TemporaryParts) -> None:
-        """Ignore them: formations do not drive around parts of lanes."""
+        """Plan with other parts of lanes that are closed; formations do not clear lanes."""
+        if temporary.closed != self._closed:
+            self._closed = temporary.closed
+            self._groups.changed = True
 
     def on_clock(self, t_s: float, now_s: float) -> None:
         """Measure the ratio of road time to the node's clock."""
@@ -111,11 +118,11 @@ class FormationsOperation:
                 yield LogEntry(VEHICLES_AWAITED, data | {"phase": leader.phase.value})
 
     def _update_members(self, census: Census, t_s: float, now_s: float) -> Iterator[LogEntry]:
-        formations = closed_formations(census, t_s, self._scenario, self._groups)
+        formations = closed_formations(census, t_s, self._scenario, self._groups, self._closed)
         for numbers in joinable(formations, t_s, self._scenario):
             self._groups.join(numbers)
             yield LogEntry(FORMATIONS_JOINED, {"formations": list(numbers), "why": "room"})
-            formations = closed_formations(census, t_s, self._scenario, self._groups)
+            formations = closed_formations(census, t_s, self._scenario, self._groups, self._closed)
         self._groups.forget_departed(census, self._scenario.lattice.block_of)
         for number in set(self.leaders) - set(formations):
             del self.leaders[number]
@@ -125,7 +132,25 @@ class FormationsOperation:
                 self.leaders[number] = self._lead_formation(formation, t_s, now_s)
                 self._reconsider_neighbours(formation)
             else:
-                leader.on_members(formation, now_s)
+                leader.on_members(self._with_stage(formation, leader.formation, t_s), now_s)
+
+    def _with_stage(self, formation: Formation, before: Formation, t_s: float) -> Formation:
+        """Return a formation with the stage for which it has a plan, if it is to keep that.
+
+        Lines move as queues grow and vanish. Where it is too late for a new plan, the one in force
+        would only be lost.
+        """
+        stage, goals = formation.stage, before.goal_lanes
+        if (
+            stage == before.stage
+            or formation.sorts != before.sorts
+            or not formation.goal_lanes.keys() <= goals.keys()
+            or not (stage.is_last or formation.goal_lanes.items() <= goals.items())
+            or self._planner.steps_left_in(formation.numbers, stage, t_s) > 0
+        ):
+            return formation
+        kept = tuple(goals[name] for name in formation.roster)
+        return evolve(formation, stage=before.stage, goals=kept)
 
     def _reconsider_neighbours(self, formation: Formation) -> None:
         """Let the formations beside a new one plan again if they may join it and lack room."""

@@ -14,13 +14,14 @@ formations stay joined until their vehicles have left. Every vehicle stores the 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from itertools import pairwise
 
 from attrs import define, field, frozen
 
-from laneweave.coordinator.formations.stages import stages
+from laneweave.coordinator.formations.stages import WHOLE_ROAD, Stage, stages, with_queues
 from laneweave.protocol.lattice import Cell
+from laneweave.protocol.road_layout import TemporaryClosure
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.wire.messages import Census, CensusEntry, Name
 
@@ -47,8 +48,8 @@ class Formation:
     deserted: Numbers = ()
     """Blocks of joined formations whose vehicles have all left the road. Plans avoid them, since
     vehicles of formations joined under another leader may be there."""
-    stage: int = 0
-    """Index of the stage to plan (`stages`)."""
+    stage: Stage = WHOLE_ROAD
+    """Stage to plan."""
     goals: tuple[frozenset[int], ...] = ()
     """Goal lanes of each member; empty: it forms a structure, with any member in any place."""
 
@@ -112,7 +113,11 @@ class Groups:
 
 
 def closed_formations(
-    census: Census, t_s: float, scenario: Scenario, groups: Groups
+    census: Census,
+    t_s: float,
+    scenario: Scenario,
+    groups: Groups,
+    parts: Iterable[TemporaryClosure] = (),
 ) -> dict[int, Formation]:
     """Return the closed formations on the road by their lowest block number.
 
@@ -124,8 +129,9 @@ def closed_formations(
         t_s: road time.
         scenario: lattice, structures.
         groups: blocks planned together; the blocks of each closed formation are merged here.
+        parts: parts of lanes that are closed for a time.
     """
-    lattice = scenario.lattice
+    lattice, of_road = scenario.lattice, stages(scenario, with_queues(parts, census, scenario))
     closed_s: dict[int, list[float]] = {}
     for closed in census.formations:
         groups.join(closed.blocks)
@@ -140,8 +146,7 @@ def closed_formations(
     for first, each in sorted(members.items()):
         numbers, times_s = groups.of(first), closed_s.get(first, [0.0])
         if numbers[-1] <= census.closed_to:
-            number = stage_at(numbers, t_s, scenario)
-            stage = stages(scenario)[number]
+            stage = stage_at(numbers, t_s, of_road, scenario)
             each.sort(key=lambda entry: entry.vehicle)
             goals = (stage.goal_lanes(entry.preferred_lane, entry.destination) for entry in each)
             formations[first] = Formation(
@@ -150,60 +155,61 @@ def closed_formations(
                 closed_s=max(times_s),
                 joined=len(times_s),
                 deserted=tuple(block for block in numbers if block not in listed_blocks),
-                stage=number,
+                stage=stage,
                 goals=tuple(goals) if stage.structure is None else (),
             )
     return formations
 
 
-def stage_at(numbers: Numbers, t_s: float, scenario: Scenario) -> int:
-    """Return the index of the stage that a formation should plan at a road time.
+def stage_at(numbers: Numbers, t_s: float, of_road: Sequence[Stage], scenario: Scenario) -> Stage:
+    """Return the stage of a road that a formation should plan at a road time.
 
     The first stage is planned at once. Each later one is planned `STAGE_LEAD_S` before the rear of
     the formation reaches it, but not before the rear has passed a stage in which lanes are sorted.
     """
-    later = range(1, len(stages(scenario)))
-    return sum(
+    begun = sum(
         max(
             stage_begin_s(numbers, stage, scenario) - STAGE_LEAD_S,
-            stage_end_s(numbers, stage - 1, scenario),
+            stage_end_s(numbers, before, scenario),
         )
         <= t_s
-        for stage in later
+        for before, stage in pairwise(of_road)
     )
+    return of_road[begun]
 
 
-def stage_begin_s(numbers: Numbers, stage: int, scenario: Scenario) -> float:
+def stage_begin_s(numbers: Numbers, stage: Stage, scenario: Scenario) -> float:
     """Return the road time at which all bodies in some blocks have passed the start of a stage."""
-    lattice, from_m = scenario.lattice, stages(scenario)[stage].from_m
+    lattice, from_m = scenario.lattice, stage.from_m
     rear = lattice.block_range(numbers[-1])[0]
     return lattice.passing_time_s(rear, from_m + scenario.types.longest_body_m)
 
 
-def stage_end_s(numbers: Numbers, stage: int, scenario: Scenario) -> float:
+def stage_end_s(numbers: Numbers, stage: Stage, scenario: Scenario) -> float:
     """Return the road time by which the plan of a stage should be complete.
 
     At this time the next stage is planned or, in the last one, the front of the formation leaves
     the road. In lanes that end with the stage, moves must be complete before (`moves_end_s`).
     """
-    lattice, of_road = scenario.lattice, stages(scenario)
-    if of_road[stage].structure is not None:
-        return stage_begin_s(numbers, stage + 1, scenario) - STAGE_LEAD_S
+    lattice = scenario.lattice
+    if stage.structure is not None:
+        begins_m = stage.to_m + scenario.types.longest_body_m
+        return lattice.passing_time_s(lattice.block_range(numbers[-1])[0], begins_m) - STAGE_LEAD_S
     rear, front = lattice.block_range(numbers[-1])[0], lattice.block_range(numbers[0])[-1]
-    is_last = stage == len(of_road) - 1
-    return lattice.passing_time_s(front if is_last else rear, of_road[stage].to_m)
+    return lattice.passing_time_s(front if stage.is_last else rear, stage.to_m)
 
 
-def moves_end_s(cells: Collection[Cell], numbers: Numbers, stage: int, scenario: Scenario) -> float:
+def moves_end_s(
+    cells: Collection[Cell], numbers: Numbers, stage: Stage, scenario: Scenario
+) -> float:
     """Return the road time by which moves from and to some cells should be complete.
 
     A cell of a lane that ends passes the end of the stage then; in the last stage, any cell.
     """
-    of_road = stages(scenario)
-    to_m, ends_s = of_road[stage].to_m, stage_end_s(numbers, stage, scenario)
-    if stage == len(of_road) - 1:
+    to_m, ends_s = stage.to_m, stage_end_s(numbers, stage, scenario)
+    if stage.is_last:
         return exit_time_s(cells, scenario, to_m)
-    ending = [cell for cell in cells if cell[1] in of_road[stage].ending_lanes]
+    ending = [cell for cell in cells if cell[1] in stage.ending_lanes]
     return min(ends_s, exit_time_s(ending, scenario, to_m)) if ending else ends_s
 
 
@@ -225,7 +231,8 @@ def joinable(
             and front.numbers[-1] + 1 == rear.numbers[0]
             and front.joined + rear.joined <= formation.max_joined
             and len(front.members) + len(rear.members) <= formation.max_vehicles
-            and t_s < stage_begin_s(front.numbers, len(formation.structures), scenario)
+            and not front.stage.sorted_before
+            and (front.stage.structure or t_s < stage_begin_s(front.numbers, front.stage, scenario))
         ):
             paired |= {ahead, behind}
             yield (*front.numbers, *rear.numbers)
@@ -251,11 +258,12 @@ def sorting_start_s(
 ) -> float:
     """Return the tick [s] from which vehicles in these cells may sort their lanes in a stage.
 
-    The rearmost body has passed `from_m` by then, and vehicles from ramps have settled. Others have
-    S1 and S2 to settle; where these are too short, the start gate waits for them.
+    The rearmost body has passed `from_m` by then, and vehicles from ramps have settled. In S3,
+    others have S1 and S2 to settle; where these are too short, the start gate waits for them.
     """
-    if from_ramps := [cell for cell in cells if scenario.geometry.entry_m[cell[1]] > 0.0]:
-        not_before_s = max(not_before_s, settled_s(from_ramps, scenario))
+    early = from_m < scenario.road.sorting_start_m
+    if settling := [cell for cell in cells if early or scenario.geometry.entry_m[cell[1]] > 0.0]:
+        not_before_s = max(not_before_s, settled_s(settling, scenario))
     return start_time_s(cells, not_before_s, scenario, from_m)
 
 

@@ -10,15 +10,31 @@ destination. If none of them is open yet, it needs the nearest lane that goes on
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterable, Iterator
 from functools import cached_property, lru_cache
 from itertools import pairwise
+from operator import itemgetter
 
-from attrs import frozen
+from attrs import evolve, field, frozen
 
-from laneweave.protocol.road_layout import ANY_LANE, END_OF_ROAD, LaneSection
+from laneweave.protocol.road_layout import (
+    ANY_LANE,
+    END_OF_ROAD,
+    LaneSection,
+    TemporaryClosure,
+    cut,
+)
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.formation_table import DrivingStructure
 from laneweave.protocol.vehicle.lane_ends import sections_to_lines
+from laneweave.protocol.vehicle.sudden_stops import queue_pitch_m
+from laneweave.protocol.wire.messages import Census, OffLattice
+
+SORTING_M = 300.0
+"""Length of road in which a formation can sort its lanes: S3 of the paper, Section 6.2."""
+QUEUE_M = 50.0
+"""Lengths of queues are rounded up to multiples of this."""
 
 
 @frozen
@@ -32,9 +48,16 @@ class Stage:
     structure: DrivingStructure | None = None
     """Structure to form, with any vehicle in any place; None: sort by goal lanes."""
     road: tuple[LaneSection, ...] = ()
-    """All sections of the road."""
+    """Sections of the road that do not end before the stage begins."""
     lines_m: tuple[float, ...] = ()
     """Where moves must have ended in each of them."""
+    number: int = field(default=0, eq=False)
+    """Index among the stages of the road."""
+    is_last: bool = field(default=True, eq=False)
+    sorted_before: bool = field(default=False, eq=False)
+    """Whether lanes are sorted in an earlier stage."""
+    avoids: bool = False
+    """Whether vehicles need any lane that goes on, since they sort in a later stage."""
 
     @cached_property
     def open_sections(self) -> list[tuple[LaneSection, float]]:
@@ -67,6 +90,8 @@ class Stage:
         A vehicle that can no longer change to the lane of its exit drives to the end of the road,
         unless it is in that lane.
         """
+        if self.avoids:
+            return self.through_lanes
         serving = self._serving(preferred_lane, destination)
         wanted = [one for one, line_m in serving if line_m > self.from_m]
         if not wanted:
@@ -95,33 +120,143 @@ class Stage:
         ]
 
 
-@lru_cache(maxsize=16)
-def stages(scenario: Scenario) -> tuple[Stage, ...]:
-    """Return the stages of formations, from the start of the road to its end."""
-    road, structures = scenario.road, scenario.formation.structures
-    lines_m = tuple(one.to_m for one in sections_to_lines(scenario))
-    start_m, end_m = road.sorting_start_m, road.length_m
-    changes_m = {
-        position_m
-        for one, line_m in zip(scenario.geometry.sections, lines_m, strict=True)
-        for position_m in (max(one.from_m, one.moves_from_m), line_m)
-        if start_m < position_m < end_m
-    }
-    ends_m, shortest_m = {*lines_m, end_m}, scenario.formation.longest_m + scenario.types.step_m
-    parts_m, from_m = [*pairwise([*(one.from_m for one in structures), start_m])], start_m
-    for position_m in sorted({*changes_m, end_m}):
-        known_m = max(from_m, *scenario.geometry.entry_m)
-        # Before a lane that begins, a stage is left out that is too short for a formation.
-        if position_m in ends_m or position_m >= known_m + shortest_m:
-            parts_m.append((from_m, position_m))
-        from_m = position_m
+WHOLE_ROAD = Stage(0.0, math.inf)
+"""The stage of a formation for which none has been chosen."""
+
+
+@lru_cache(maxsize=64)
+def stages(scenario: Scenario, closed: tuple[TemporaryClosure, ...] = ()) -> tuple[Stage, ...]:
+    """Return the stages of formations, from the start of the road to its end.
+
+    Before a part that is closed for a time, vehicles change lanes from the start of the road on:
+    before S3 into any lane that goes on, otherwise to sort. Structures are formed only behind all
+    of these parts.
+
+    Args:
+        scenario: road, structures.
+        closed: parts that are closed for a time (`with_queues`).
+    """
+    start_m, road_m = scenario.road.sorting_start_m, scenario.road.length_m
+    passed_m = max((one.to_m for one in closed), default=0.0)
+    structures = [one for one in scenario.formation.structures if one.from_m >= passed_m]
+    formed_m = pairwise([*(one.from_m for one in structures), start_m])
+    parts = [
+        *((*each_m, one, False) for each_m, one in zip(formed_m, structures, strict=True)),
+        *(
+            (from_m, to_m, None, sudden and to_m <= max(start_m, road_m - SORTING_M))
+            for from_m, to_m, sudden in _sorting_m(scenario, closed)
+        ),
+    ]
+    parts.sort(key=itemgetter(0))
+    sections = cut(scenario.geometry.sections, closed)
+    lines_m = [one.to_m for one in sections_to_lines(scenario, closed)]
+    made = list[Stage]()
+    for from_m, to_m, structure, avoids in parts:
+        # What lies behind a formation does not change its stage.
+        ahead = [
+            (_begun(one, from_m), line_m)
+            for one, line_m in zip(sections, lines_m, strict=True)
+            if one.to_m > from_m
+        ]
+        road, ends_m = zip(*ahead, strict=True)
+        made.append(Stage(from_m, to_m, structure, road, ends_m, avoids=avoids))
+    made = [stage for stage in made if stage.lanes]
+    first = next(number for number, stage in enumerate(made) if stage.structure is None)
     return tuple(
-        Stage(
-            begins_m,
-            to_m,
-            structures[number] if number < len(structures) else None,
-            scenario.geometry.sections,
-            lines_m,
+        evolve(stage, number=number, is_last=number == len(made) - 1, sorted_before=number > first)
+        for number, stage in enumerate(made)
+    )
+
+
+def _begun(section: LaneSection, from_m: float) -> LaneSection:
+    begins_m, moves_from_m = max(section.from_m, from_m), max(section.moves_from_m, from_m)
+    return evolve(section, from_m=begins_m, moves_from_m=moves_from_m)
+
+
+def _sorting_m(
+    scenario: Scenario, closed: tuple[TemporaryClosure, ...]
+) -> Iterator[tuple[float, float, bool]]:
+    """Yield stages in which lanes change: begin, end, whether a part ends them for a time."""
+    road, always = scenario.road, len(scenario.geometry.sections)
+    sections = cut(scenario.geometry.sections, closed)
+    lines_m = [one.to_m for one in sections_to_lines(scenario, closed)]
+    ends_m, sudden_m = {*lines_m, road.length_m}, {*lines_m[always:]}
+    begin_m = {max(one.from_m, one.moves_from_m) for one in sections}
+    from_m = 0.0
+    for position_m in sorted(ends_m | begin_m):
+        if not 0.0 < position_m <= road.length_m:
+            continue
+        begins_m = from_m if position_m in sudden_m else max(from_m, road.sorting_start_m)
+        known_m = max(begins_m, *scenario.geometry.entry_m)
+        beside = any(one.from_m < position_m and begins_m < one.to_m for one in closed)
+        # Before a lane that begins, a stage is left out that is too short for a formation, and
+        # beside a part that is closed for a time, since vehicles have just left its lane.
+        if begins_m < position_m and (
+            position_m in ends_m or (position_m >= known_m + shortest_m(scenario) and not beside)
+        ):
+            yield begins_m, position_m, position_m in sudden_m
+        from_m = position_m
+
+
+def shortest_m(scenario: Scenario) -> float:
+    """Return the length of the shortest stage in which a formation can move."""
+    return scenario.formation.longest_m + scenario.types.step_m
+
+
+def with_queues(
+    closed: Iterable[TemporaryClosure], census: Census, scenario: Scenario
+) -> tuple[TemporaryClosure, ...]:
+    """Return parts that are closed for a time, with the vehicles that wait before or behind them.
+
+    Parts of different lanes begin together if no formation can move between them. The beginnings
+    are rounded, since every new one makes formations plan again.
+
+    Args:
+        closed: parts that are closed for a time.
+        census: vehicles on the road.
+        scenario: road.
+    """
+    off_lattice = [entry.off_lattice for entry in census.on_road if entry.off_lattice is not None]
+    waiting = [body for body in off_lattice if body.waits and _goes_on(body, scenario)]
+    parts = [
+        part
+        for lane in range(scenario.road.lanes)
+        for part in _with_queues_of_lane(
+            lane,
+            [one for one in closed if one.lane == lane],
+            [body.rear_m for body in waiting if body.lane == lane],
+            scenario,
         )
-        for number, (begins_m, to_m) in enumerate(parts_m)
+    ]
+    group_m, found = -math.inf, list[TemporaryClosure]()
+    for part in sorted(parts, key=lambda part: part.from_m):
+        if part.from_m >= group_m + shortest_m(scenario):
+            group_m = part.from_m
+        found.append(part._replace(from_m=group_m))
+    return tuple(found)
+
+
+def _with_queues_of_lane(
+    lane: int, closed: list[TemporaryClosure], rears_m: list[float], scenario: Scenario
+) -> Iterator[TemporaryClosure]:
+    """Yield the closed parts of a lane with the queues before them, and a queue behind all."""
+    for part in sorted(closed):
+        before_m = [rear_m for rear_m in rears_m if rear_m < part.from_m]
+        rears_m = [rear_m for rear_m in rears_m if rear_m >= part.to_m]
+        if before_m:
+            begins_m = QUEUE_M * math.floor(min(before_m) / QUEUE_M)
+            yield part._replace(from_m=begins_m, late_m=0.0)
+        else:
+            yield part
+    if rears_m:
+        begins_m = QUEUE_M * math.floor(min(rears_m) / QUEUE_M)
+        length_m = QUEUE_M * math.ceil(len(rears_m) * queue_pitch_m(scenario) / QUEUE_M)
+        yield TemporaryClosure(lane, begins_m, begins_m + length_m)
+
+
+def _goes_on(body: OffLattice, scenario: Scenario) -> bool:
+    """Return whether the lane of a body goes on ahead of it while no part is closed for a time."""
+    return any(
+        one.lane == body.lane and one.from_m <= body.rear_m < one.to_m and one.exit
+        for one in scenario.geometry.sections
     )

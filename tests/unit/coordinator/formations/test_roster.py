@@ -17,6 +17,7 @@ from laneweave.coordinator.formations.roster import (
     start_time_s,
     steps_left,
 )
+from laneweave.coordinator.formations.stages import stages
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.road_tables import Road
@@ -45,7 +46,8 @@ def formation_of(
 ) -> Formation:
     """Return a formation whose members all prefer lane 0, on a road with one stage."""
     goals = (frozenset({0}),) * len(members)
-    return Formation(numbers, members, closed_s, joined, deserted, goals=goals)
+    (stage,) = stages(PAPER if numbers == (0,) else GROWING)
+    return Formation(numbers, members, closed_s, joined, deserted, stage, goals)
 
 
 def census(t_s: float, **cells: Cell) -> Census:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import pytest
 from attrs import evolve
 from hypothesis import given
@@ -16,12 +18,14 @@ from laneweave.coordinator.formations.roster import (
     stage_begin_s,
     stage_end_s,
 )
-from laneweave.coordinator.formations.stages import Stage, stages
-from laneweave.protocol.road_layout import ANY_LANE
+from laneweave.coordinator.formations.stages import QUEUE_M, Stage, stages, with_queues
+from laneweave.protocol.road_layout import ANY_LANE, TemporaryClosure
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.formation_table import DrivingStructure, FormationSettings
 from laneweave.protocol.scenario.road_tables import Closure, Entrance, Exit, Road
 from laneweave.protocol.vehicle.lane_ends import re_entry
+from laneweave.protocol.vehicle.sudden_stops import queue_pitch_m
+from laneweave.protocol.wire.messages import Census, CensusEntry, Name, OffLattice
 
 ROOM_M = re_entry(Scenario(road=Road(closures=(Closure(0, 800.0),)))).room_m
 """Distance between a line and the end of its lane."""
@@ -136,26 +140,28 @@ def test_goal_lanes_are_open_and_go_on_or_lead_to_the_destination(
 @pytest.mark.parametrize("scenario", [DROP, BLOCKED, OFF_RAMP, WEAVING])
 def test_stages_follow_each_other_as_the_formation_passes_them(scenario: Scenario) -> None:
     lattice, numbers = scenario.lattice, (3, 4, 5)
-    found = [stage_at(numbers, 0.1 * tick, scenario) for tick in range(1200)]
+    of_road = stages(scenario)
+    found = [stage_at(numbers, 0.1 * tick, of_road, scenario).number for tick in range(1200)]
     assert found == sorted(found)
-    assert {*found} == {*range(len(stages(scenario)))}
-    for number in range(1, len(stages(scenario))):
+    assert {*found} == {*range(len(of_road))}
+    for number in range(1, len(of_road)):
         first_s = 0.1 * found.index(number)
         # All bodies have passed the stage before; planning takes a part of the time that is left.
         rear_m = lattice.cell_s_m(-5, first_s)
-        assert rear_m >= stages(scenario)[number - 1].to_m - 1e-6
-        begin_s = stage_begin_s(numbers, number, scenario)
+        assert rear_m >= of_road[number - 1].to_m - 1e-6
+        begin_s = stage_begin_s(numbers, of_road[number], scenario)
         assert first_s >= begin_s - STAGE_LEAD_S - 0.1
 
 
 def test_moves_out_of_a_lane_are_complete_before_each_vehicle_passes_its_line() -> None:
     lattice, numbers, line_m = DROP.lattice, (0, 1, 2), 800.0 - ROOM_M
+    before, after = stages(DROP)
     for cells, column in (([(0, 1), (-1, 0)], -1), ([(0, 0), (-1, 0)], 0), ([(0, 1), (-1, 2)], -2)):
-        assert moves_end_s(cells, numbers, 0, DROP) == lattice.passing_time_s(column, line_m)
+        assert moves_end_s(cells, numbers, before, DROP) == lattice.passing_time_s(column, line_m)
     # In the last stage nobody may still move at the end of the road.
-    assert moves_end_s([(-1, 1)], numbers, 1, DROP) == lattice.passing_time_s(-1, 1000.0)
-    assert stage_end_s(numbers, 0, DROP) == lattice.passing_time_s(-2, line_m)
-    assert stage_end_s(numbers, 1, DROP) == lattice.passing_time_s(0, 1000.0)
+    assert moves_end_s([(-1, 1)], numbers, after, DROP) == lattice.passing_time_s(-1, 1000.0)
+    assert stage_end_s(numbers, before, DROP) == lattice.passing_time_s(-2, line_m)
+    assert stage_end_s(numbers, after, DROP) == lattice.passing_time_s(0, 1000.0)
 
 
 def test_vehicles_from_a_ramp_settle_later() -> None:
@@ -175,3 +181,102 @@ def test_formations_sort_when_vehicles_from_ramps_have_settled() -> None:
     settled = settled_s([from_ramp], WEAVING)
     assert 0.0 <= sorting_start_s([*main, from_ramp], 0.0, WEAVING, from_m) - settled < tick_s
     assert sorting_start_s([*main, from_ramp], 99.0, WEAVING, from_m) == pytest.approx(99.0)
+
+
+S3_M = Scenario().road.sorting_start_m
+PART = TemporaryClosure(1, 300.0, 320.0)
+"""A part before S3 of the default road."""
+PART_IN_S3 = TemporaryClosure(1, S3_M + 100.0, S3_M + 110.0)
+
+
+def test_before_a_closed_part_vehicles_leave_its_lane_and_sort_in_s3() -> None:
+    scenario = Scenario()
+    around, sorting = stages(scenario, (PART,))
+    assert (around.from_m, around.is_last, sorting.is_last) == (0.0, False, True)
+    assert PART.from_m - 2.0 * ROOM_M < around.to_m < PART.from_m
+    assert lanes(around) == ([0, 1, 2], [1])
+    assert [around.goal_lanes(lane) for lane in range(3)] == [{0, 2}] * 3
+    # A formation that has passed the part plans as on the open road, and does not plan again.
+    assert sorting == stages(scenario)[0]
+
+
+def test_before_a_part_in_s3_vehicles_sort_from_the_start_of_the_road_on() -> None:
+    before, behind = stages(Scenario(), (PART_IN_S3,))
+    assert (before.from_m, behind.from_m) == (0.0, PART_IN_S3.to_m)
+    assert [before.goal_lanes(lane) for lane in range(3)] == [{0}, {0, 2}, {2}]
+    assert [behind.goal_lanes(lane) for lane in range(3)] == [{0}, {1}, {2}]
+
+
+def test_structures_are_formed_only_behind_closed_parts() -> None:
+    structures = (DrivingStructure(100.0, "parallel"), DrivingStructure(340.0, "interlaced"))
+    scenario = Scenario(formation=FormationSettings(structures=structures))
+    around, formed, sorting = stages(scenario, (PART,))
+    assert [one.structure for one in (around, formed, sorting)] == [None, structures[1], None]
+    assert (formed.from_m, formed.to_m, sorting.from_m) == (340.0, S3_M, S3_M)
+    assert [one.sorted_before for one in (around, formed, sorting)] == [False, True, True]
+
+
+def waiting(*bodies: tuple[int, float]) -> Census:
+    """Return a census with vehicles without cells in a lane, whose rears are at a position."""
+    entries = (
+        CensusEntry(Name(f"v{number}"), (0, lane), 0, 0.0, OffLattice(lane, rear_m))
+        for number, (lane, rear_m) in enumerate(bodies)
+    )
+    return Census(0.0, tuple(entries), ())
+
+
+def test_a_lane_is_closed_from_its_queue_on() -> None:
+    scenario = Scenario()
+    assert with_queues((PART,), waiting(), scenario) == (PART,)
+    # Vehicles in the part, and in other lanes, do not wait for it.
+    before = with_queues((PART,), waiting((1, 283.0), (1, 276.0), (1, 305.0)), scenario)
+    assert before == (TemporaryClosure(1, 250.0, 320.0),)
+    # The part is open again, but vehicles still stand there.
+    assert with_queues((), waiting((1, 483.0)), scenario) == (
+        TemporaryClosure(1, 450.0, 450.0 + QUEUE_M),
+    )
+    many = with_queues((), waiting(*((1, 480.0 - 7.0 * number) for number in range(12))), scenario)
+    assert many[0].to_m >= 400.0 + 12 * queue_pitch_m(scenario)
+    # A queue before the end of a lane of the road is known from its line.
+    assert with_queues((), waiting((0, 770.0)), DROP) == ()
+
+
+def test_parts_of_two_lanes_between_which_nobody_can_move_are_one() -> None:
+    scenario = Scenario()
+    near, far = TemporaryClosure(0, 330.0, 340.0), TemporaryClosure(0, 100.0, 110.0)
+    parts = with_queues((near, PART), waiting(), scenario)
+    assert {*parts} == {PART, near._replace(from_m=PART.from_m)}
+    around = stages(scenario, parts)[0]
+    assert around.goal_lanes(1) == {2}
+    assert {*with_queues((far, PART), waiting(), scenario)} == {far, PART}
+
+
+def test_with_all_lanes_closed_formations_still_have_stages() -> None:
+    scenario = Scenario()
+    parts = with_queues(
+        [TemporaryClosure(lane, 300.0, 600.0) for lane in range(3)], waiting(), scenario
+    )
+    found = stages(scenario, parts)
+    assert all(stage.lanes and stage.goal_lanes(1) for stage in found)
+
+
+@given(
+    st.lists(
+        st.tuples(st.integers(0, 2), st.floats(-50.0, 1050.0), st.floats(1.0, 300.0)), max_size=5
+    ),
+    st.lists(st.tuples(st.integers(0, 2), st.floats(0.0, 1000.0)), max_size=5),
+    st.sampled_from([Scenario(), STRAIGHT, DROP, BLOCKED]),
+)
+def test_whatever_is_closed_there_are_stages_with_open_lanes(
+    drawn: list[tuple[int, float, float]], bodies: list[tuple[int, float]], scenario: Scenario
+) -> None:
+    closed = [TemporaryClosure(lane, from_m, from_m + m) for lane, from_m, m in drawn]
+    found = stages(scenario, with_queues(closed, waiting(*bodies), scenario))
+    assert [stage.number for stage in found] == [*range(len(found))]
+    for before, behind in pairwise(found):
+        assert before.to_m <= behind.from_m + 1e-6
+    for stage in found:
+        assert stage.from_m < stage.to_m
+        assert stage.goal_lanes(ANY_LANE)
+        assert stage.goal_lanes(0) <= stage.lanes | {0}
+    assert found[-1].is_last
