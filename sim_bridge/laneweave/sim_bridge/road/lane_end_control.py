@@ -172,22 +172,26 @@ class LaneEndControl:
                 # Parts that are closed for a time come and go ahead of it.
                 lane, s_m = controller.hold_cell[1], vehicle.state[0]
                 self._end_of[name] = self._end_ahead(lane, s_m)
-        for at, gaps in self._gaps.items():
+        for at, gaps in sorted(self._gaps.items(), key=lambda each: -each[0][1]):
             startable = self._startable(at, vehicles)
-            if startable:
+            if startable and not self._waits_ahead(startable[0], at, vehicles):
                 usable = [gap for gap in gaps if self._may_take(gap, at, startable[0])]
                 yield from self._start(startable[0], usable, t_s)
                 startable = self._startable(at, vehicles)
             yield from self._arrive(gaps, vehicles, t_s)
+            if startable and False in self._waits_ahead(startable[0], at, vehicles):
+                startable = []
             last_m = max([self._ends[at].line_m, *(one.state[0] for one in startable[:1])])
             gaps[:] = [gap for gap in gaps if gap.vehicle or not self._is_over(gap, last_m, t_s)]
             free = [gap for gap in gaps if gap.vehicle is None]
+            ahead_m = -math.inf
             for vehicle in startable:
                 own = next((gap for gap in free if self._may_take(gap, at, vehicle)), None)
                 if own is None:
-                    self._request(at, vehicle, gaps, t_s)
+                    self._request(at, vehicle, gaps, t_s, ahead_m)
                     break
                 free.remove(own)
+                ahead_m = vehicle.state[0]
 
     def bodies(self, vehicles: Mapping[Name, RoadVehicle]) -> dict[Name, OffLattice]:
         """Return the lane and the rear of each vehicle without cells.
@@ -204,11 +208,27 @@ class LaneEndControl:
             if name in vehicles and name not in found:
                 s_m, _, _, y_m, _, _ = vehicles[name].state
                 lane = int(y_m // self._lattice.lane_width_m)
-                found[name] = OffLattice(lane, s_m - vehicles[name].size[0])
+                waits = vehicles[name].controller.off_lattice is OffLatticePhase.WAITING
+                found[name] = OffLattice(lane, s_m - vehicles[name].size[0], waits)
         return found
 
-    def _request(self, at: LanePosition, vehicle: RoadVehicle, gaps: list[Gap], t_s: float) -> None:
-        """Keep the next columns free for a vehicle, unless the last gap was too close ahead."""
+    def _request(
+        self,
+        at: LanePosition,
+        vehicle: RoadVehicle,
+        gaps: list[Gap],
+        t_s: float,
+        ahead_m: float,
+    ) -> None:
+        """Keep the next columns free for a vehicle, unless the last gap was too close ahead.
+
+        Args:
+            at: dead end at which the vehicle waits.
+            vehicle: the vehicle.
+            gaps: those of the dead end.
+            t_s: road time.
+            ahead_m: front of the vehicle that gets the gap before; -inf: there is none.
+        """
         own = self._starts_in_own_lane(at, vehicle)
         lane = at[0] if own else self._beside(at, vehicle)
         if lane is None:
@@ -219,7 +239,9 @@ class LaneEndControl:
         crowded = any(arrival.entry_point in taken for arrival in self._meter.waiting)
         between = (CROWDED_GAPS if crowded else OPEN_GAPS) * self._columns
         if own:
-            between = 0  # others enter the lane only behind it
+            # Others enter the lane only behind it. Its gap reaches it after the vehicle ahead has
+            # started, which the gap before passes later the farther ahead that vehicle waits.
+            between = math.ceil(max(ahead_m - vehicle.state[0], 0.0) / self._lattice.pitch_m)
         last = self._last_gap_column.get(point, math.inf)
         if self._meter.next_column(point) < last - between:
             columns = self._meter.keep_free(point, self._columns, t_s)
@@ -311,23 +333,24 @@ class LaneEndControl:
     def _startable(
         self, at: LanePosition, vehicles: Mapping[Name, RoadVehicle]
     ) -> list[RoadVehicle]:
-        """Return the vehicles that may start from where they wait, foremost first.
+        """Return the vehicles that may start from where they wait, foremost first."""
+        return [one for one in self._waiting(at, vehicles) if self._may_start(at, one)]
 
-        None may while others wait so near ahead of the first, at this dead end or the next one,
-        that it has no room to start.
+    def _waits_ahead(
+        self, vehicle: RoadVehicle, at: LanePosition, vehicles: Mapping[Name, RoadVehicle]
+    ) -> set[bool]:
+        """Return whether vehicles that wait ahead of one may start themselves.
+
+        These are the vehicles at this dead end or the next ones that leave it no room to start.
         """
-        startable = [one for one in self._waiting(at, vehicles) if self._may_start(at, one)]
-        if not startable:
-            return []
-        s_m = startable[0].state[0]
-        ahead_m = (
-            one.state[0] - one.size[0]
+        s_m = vehicle.state[0]
+        return {
+            self._may_start(other, one)
             for other in self._ends
             if other[0] == at[0]
             for one in self._waiting(other, vehicles)
-            if one.state[0] > s_m
-        )
-        return startable if min(ahead_m, default=math.inf) - s_m >= self._room_m else []
+            if one.state[0] > s_m and one.state[0] - one.size[0] - s_m < self._room_m
+        }
 
     def _waiting(self, at: LanePosition, vehicles: Mapping[Name, RoadVehicle]) -> list[RoadVehicle]:
         """Return the vehicles that wait at a dead end, foremost first."""
