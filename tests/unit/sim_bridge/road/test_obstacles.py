@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from itertools import pairwise
 
 import pytest
 from attrs import evolve
@@ -155,6 +156,18 @@ def test_others_stop_at_the_line_or_behind_it_and_never_touch_the_vehicle() -> N
     assert len(others) >= 3
     assert all(front_m < part.from_m for front_m in others)
     assert sum(front_m > line_m + 1.0 for front_m in others) * 6.0 <= part.late_m
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_those_that_wait_start_one_after_the_other_wherever_they_stand(seed: int) -> None:
+    """Each gap passes a vehicle once the one ahead has started, or it would have to wait anew."""
+    road = lonely_road(BREAKS_DOWN, volume=1450.0, seed=seed)
+    starts_s: list[float] = []
+    while len(starts_s) < 4:
+        road.step()
+        starts_s = [t_s for t_s, kind, _ in road.events if kind == DRIVES_OUT]
+    again_s = road.scenario.lattice.passing_time_s(0, AT_M)
+    assert all(later - before < 0.5 * again_s for before, later in pairwise(starts_s))
 
 
 def test_a_vehicle_may_be_named_and_others_are_drawn() -> None:
