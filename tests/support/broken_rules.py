@@ -20,6 +20,7 @@ from laneweave.coordinator.rolling.ownership import States
 from laneweave.coordinator.rolling.transfer import CellTransfer
 from laneweave.launch.fault_search.road.drawn_entrance import DrawnBlocks
 from laneweave.protocol.lattice import Cell
+from laneweave.protocol.road_layout import TemporaryClosure
 from laneweave.protocol.runtime.node import Effect
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.state_machine import Transition
@@ -316,11 +317,12 @@ def close_at_once(
     t_s: float,
     scenario: Scenario,
     groups: Groups,
+    parts: tuple[TemporaryClosure, ...] = (),
 ) -> dict[int, Formation]:
     blocks = sorted({scenario.lattice.block_of(entry.cell[0]) for entry in census.on_road})
     closed = tuple(ClosedFormation(block, block, 0.0) for block in blocks)
     early = replace(census, formations=closed, closed_to=FAR_BEHIND)
-    return closed_formations(early, t_s, scenario, groups)
+    return closed_formations(early, t_s, scenario, groups, parts)
 
 
 def close_early(patch: Patch) -> None:

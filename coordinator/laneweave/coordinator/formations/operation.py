@@ -72,9 +72,15 @@ class FormationsOperation:
         self._planner.forget()
 
     def on_obstacles(self, temporary: TemporaryParts) -> None:
-        """Plan with other parts of lanes that are closed; formations do not clear lanes."""
-        if temporary.closed != self._closed:
-            self._closed = temporary.closed
+        """Plan with other parts of lanes that are closed, or about to be closed.
+
+        Formations do not clear lanes for vehicles of other systems, which move.
+        """
+        at_rest = (one for one in temporary.cleared if one.speed_mps == 0.0)
+        soon = (TemporaryClosure(one.lane, one.from_m, one.to_m) for one in at_rest)
+        closed = (*temporary.closed, *soon)
+        if closed != self._closed:
+            self._closed = closed
             self._groups.changed = True
 
     def on_clock(self, t_s: float, now_s: float) -> None:

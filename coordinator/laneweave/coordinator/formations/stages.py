@@ -28,7 +28,6 @@ from laneweave.protocol.road_layout import (
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.formation_table import DrivingStructure
 from laneweave.protocol.vehicle.lane_ends import sections_to_lines
-from laneweave.protocol.vehicle.sudden_stops import queue_pitch_m
 from laneweave.protocol.wire.messages import Census, OffLattice
 
 SORTING_M = 300.0
@@ -206,52 +205,36 @@ def shortest_m(scenario: Scenario) -> float:
 def with_queues(
     closed: Iterable[TemporaryClosure], census: Census, scenario: Scenario
 ) -> tuple[TemporaryClosure, ...]:
-    """Return parts that are closed for a time, with the vehicles that wait before or behind them.
+    """Return parts that are closed for a time, with the vehicles that wait before them.
 
     Parts of different lanes begin together if no formation can move between them. The beginnings
-    are rounded, since every new one makes formations plan again.
+    of queues are rounded, since every new one makes formations plan again.
 
     Args:
         closed: parts that are closed for a time.
         census: vehicles on the road.
         scenario: road.
     """
+    parts = sorted(closed)
     off_lattice = [entry.off_lattice for entry in census.on_road if entry.off_lattice is not None]
-    waiting = [body for body in off_lattice if body.waits and _goes_on(body, scenario)]
-    parts = [
-        part
-        for lane in range(scenario.road.lanes)
-        for part in _with_queues_of_lane(
-            lane,
-            [one for one in closed if one.lane == lane],
-            [body.rear_m for body in waiting if body.lane == lane],
-            scenario,
-        )
-    ]
+    waiting = [body for body in off_lattice if _goes_on(body, scenario)]
+    with_their_queues = list[TemporaryClosure]()
+    for part in parts:
+        passed_m = [one.to_m for one in parts if one.lane == part.lane and one.to_m <= part.from_m]
+        queue_m = [
+            QUEUE_M * math.floor(body.rear_m / QUEUE_M)
+            for body in waiting
+            if body.lane == part.lane
+            and max(passed_m, default=-math.inf) <= body.rear_m < part.from_m
+        ]
+        known = part._replace(from_m=min(queue_m), late_m=0.0) if queue_m else part
+        with_their_queues.append(known)
     group_m, found = -math.inf, list[TemporaryClosure]()
-    for part in sorted(parts, key=lambda part: part.from_m):
+    for part in sorted(with_their_queues, key=lambda part: part.from_m):
         if part.from_m >= group_m + shortest_m(scenario):
             group_m = part.from_m
         found.append(part._replace(from_m=group_m))
     return tuple(found)
-
-
-def _with_queues_of_lane(
-    lane: int, closed: list[TemporaryClosure], rears_m: list[float], scenario: Scenario
-) -> Iterator[TemporaryClosure]:
-    """Yield the closed parts of a lane with the queues before them, and a queue behind all."""
-    for part in sorted(closed):
-        before_m = [rear_m for rear_m in rears_m if rear_m < part.from_m]
-        rears_m = [rear_m for rear_m in rears_m if rear_m >= part.to_m]
-        if before_m:
-            begins_m = QUEUE_M * math.floor(min(before_m) / QUEUE_M)
-            yield part._replace(from_m=begins_m, late_m=0.0)
-        else:
-            yield part
-    if rears_m:
-        begins_m = QUEUE_M * math.floor(min(rears_m) / QUEUE_M)
-        length_m = QUEUE_M * math.ceil(len(rears_m) * queue_pitch_m(scenario) / QUEUE_M)
-        yield TemporaryClosure(lane, begins_m, begins_m + length_m)
 
 
 def _goes_on(body: OffLattice, scenario: Scenario) -> bool:

@@ -341,8 +341,6 @@ class OffLattice(Message, frozen=True):
     """Lane in which it is; usually one that ends, which it has not left in time."""
     rear_m: Real
     """Position of its rear bumper [m]."""
-    waits: bool = True
-    """Whether it waits; false: it drives back into the lattice."""
 
 
 class CensusEntry(Message, frozen=True):

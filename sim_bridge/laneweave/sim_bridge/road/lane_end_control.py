@@ -208,8 +208,7 @@ class LaneEndControl:
             if name in vehicles and name not in found:
                 s_m, _, _, y_m, _, _ = vehicles[name].state
                 lane = int(y_m // self._lattice.lane_width_m)
-                waits = vehicles[name].controller.off_lattice is OffLatticePhase.WAITING
-                found[name] = OffLattice(lane, s_m - vehicles[name].size[0], waits)
+                found[name] = OffLattice(lane, s_m - vehicles[name].size[0])
         return found
 
     def _request(

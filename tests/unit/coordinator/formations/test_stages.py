@@ -18,13 +18,12 @@ from laneweave.coordinator.formations.roster import (
     stage_begin_s,
     stage_end_s,
 )
-from laneweave.coordinator.formations.stages import QUEUE_M, Stage, stages, with_queues
+from laneweave.coordinator.formations.stages import Stage, stages, with_queues
 from laneweave.protocol.road_layout import ANY_LANE, TemporaryClosure
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.formation_table import DrivingStructure, FormationSettings
 from laneweave.protocol.scenario.road_tables import Closure, Entrance, Exit, Road
 from laneweave.protocol.vehicle.lane_ends import re_entry
-from laneweave.protocol.vehicle.sudden_stops import queue_pitch_m
 from laneweave.protocol.wire.messages import Census, CensusEntry, Name, OffLattice
 
 ROOM_M = re_entry(Scenario(road=Road(closures=(Closure(0, 800.0),)))).room_m
@@ -186,7 +185,8 @@ def test_formations_sort_when_vehicles_from_ramps_have_settled() -> None:
 S3_M = Scenario().road.sorting_start_m
 PART = TemporaryClosure(1, 300.0, 320.0)
 """A part before S3 of the default road."""
-PART_IN_S3 = TemporaryClosure(1, S3_M + 100.0, S3_M + 110.0)
+LATE_PART = TemporaryClosure(1, 780.0, 790.0)
+"""A part behind which there is too little road for sorting."""
 
 
 def test_before_a_closed_part_vehicles_leave_its_lane_and_sort_in_s3() -> None:
@@ -200,9 +200,9 @@ def test_before_a_closed_part_vehicles_leave_its_lane_and_sort_in_s3() -> None:
     assert sorting == stages(scenario)[0]
 
 
-def test_before_a_part_in_s3_vehicles_sort_from_the_start_of_the_road_on() -> None:
-    before, behind = stages(Scenario(), (PART_IN_S3,))
-    assert (before.from_m, behind.from_m) == (0.0, PART_IN_S3.to_m)
+def test_before_a_late_part_vehicles_sort_from_the_start_of_the_road_on() -> None:
+    before, behind = stages(Scenario(), (LATE_PART,))
+    assert (before.from_m, behind.from_m) == (0.0, LATE_PART.to_m)
     assert [before.goal_lanes(lane) for lane in range(3)] == [{0}, {0, 2}, {2}]
     assert [behind.goal_lanes(lane) for lane in range(3)] == [{0}, {1}, {2}]
 
@@ -231,14 +231,10 @@ def test_a_lane_is_closed_from_its_queue_on() -> None:
     # Vehicles in the part, and in other lanes, do not wait for it.
     before = with_queues((PART,), waiting((1, 283.0), (1, 276.0), (1, 305.0)), scenario)
     assert before == (TemporaryClosure(1, 250.0, 320.0),)
-    # The part is open again, but vehicles still stand there.
-    assert with_queues((), waiting((1, 483.0)), scenario) == (
-        TemporaryClosure(1, 450.0, 450.0 + QUEUE_M),
-    )
-    many = with_queues((), waiting(*((1, 480.0 - 7.0 * number) for number in range(12))), scenario)
-    assert many[0].to_m >= 400.0 + 12 * queue_pitch_m(scenario)
-    # A queue before the end of a lane of the road is known from its line.
-    assert with_queues((), waiting((0, 770.0)), DROP) == ()
+    assert with_queues((), waiting((1, 283.0)), scenario) == ()
+    # A queue before the end of a lane of the road has nothing to do with a part behind it.
+    behind = TemporaryClosure(0, 850.0, 870.0)
+    assert with_queues((behind,), waiting((0, 570.0)), BLOCKED) == (behind,)
 
 
 def test_parts_of_two_lanes_between_which_nobody_can_move_are_one() -> None:
