@@ -10,7 +10,14 @@ from attrs import evolve
 from laneweave.coordinator.ballots.ballot_round import PROMISED, TIME, BallotPhase
 from laneweave.coordinator.formations.formation_planner import FormationPlanner
 from laneweave.coordinator.formations.leader import FormationLeader
-from laneweave.coordinator.formations.roster import Formation, Groups, closed_formations, joinable
+from laneweave.coordinator.formations.roster import (
+    Formation,
+    Groups,
+    closed_formations,
+    joinable,
+    stage_begin_s,
+)
+from laneweave.coordinator.formations.stages import stages, with_queues
 from laneweave.coordinator.operation import LogEntry, to_vehicle
 from laneweave.coordinator.planning.response import PlanFunction
 from laneweave.protocol.road_layout import TemporaryClosure, TemporaryParts
@@ -138,25 +145,42 @@ class FormationsOperation:
                 self.leaders[number] = self._lead_formation(formation, t_s, now_s)
                 self._reconsider_neighbours(formation)
             else:
-                leader.on_members(self._with_stage(formation, leader.formation, t_s), now_s)
+                known = formation
+                if formation.stage != leader.formation.stage:
+                    known = self._with_stage(formation, leader, census, t_s)
+                leader.on_members(known, now_s)
 
-    def _with_stage(self, formation: Formation, before: Formation, t_s: float) -> Formation:
-        """Return a formation with the stage for which it has a plan, if it is to keep that.
+    def _with_stage(
+        self, formation: Formation, leader: FormationLeader, census: Census, t_s: float
+    ) -> Formation:
+        """Return a formation with the stage of its leader, if that needs no other plan.
 
-        Lines move as queues grow and vanish. Where it is too late for a new plan, the one in force
-        would only be lost.
+        Parts that are closed for a time change the stages of formations that have passed them, and
+        of those that need the same lanes as before. And where it is too late for a new plan, the
+        one in force would only be lost.
         """
-        stage, goals = formation.stage, before.goal_lanes
+        stage, before = formation.stage, leader.formation
+        goals, closed = before.goal_lanes, with_queues(self._closed, census, self._scenario)
         if (
-            stage == before.stage
+            before.stage in stages(self._scenario, closed)
             or formation.sorts != before.sorts
             or not formation.goal_lanes.keys() <= goals.keys()
-            or not (stage.is_last or formation.goal_lanes.items() <= goals.items())
-            or self._planner.steps_left_in(formation.numbers, stage, t_s) > 0
         ):
-            return formation
-        kept = tuple(goals[name] for name in formation.roster)
-        return evolve(formation, stage=before.stage, goals=kept)
+            return formation  # it has driven on to the next stage, or has new vehicles
+        same_goals = formation.goal_lanes.items() <= goals.items()
+        begun = all(
+            stage_begin_s(formation.numbers, one, self._scenario) <= t_s
+            for one in (stage, before.stage)
+        )
+        too_late = (
+            leader.phase is BallotPhase.IN_FORCE
+            and (stage.is_last or same_goals)
+            and self._planner.steps_left_in(formation.numbers, stage, t_s) <= 0
+        )
+        if (same_goals and begun and stage.needs_same_moves(before.stage)) or too_late:
+            kept = tuple(goals[name] for name in formation.roster)
+            return evolve(formation, stage=before.stage, goals=kept)
+        return formation
 
     def _reconsider_neighbours(self, formation: Formation) -> None:
         """Let the formations beside a new one plan again if they may join it and lack room."""

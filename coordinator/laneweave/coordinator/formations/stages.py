@@ -6,6 +6,9 @@ from end to end there is one such stage, lane sorting (paper, Section 5.2.1).
 
 Before the end of a stage, each vehicle should be in one of its goal lanes: those that lead to its
 destination. If none of them is open yet, it needs the nearest lane that goes on behind the stage.
+
+Parts of lanes that are closed for a time add stages in which vehicles leave these lanes
+(docs/adr/0065).
 """
 
 from __future__ import annotations
@@ -33,7 +36,7 @@ from laneweave.protocol.wire.messages import Census, OffLattice
 SORTING_M = 300.0
 """Length of road in which a formation can sort its lanes: S3 of the paper, Section 6.2."""
 QUEUE_M = 50.0
-"""Lengths of queues are rounded up to multiples of this."""
+"""Beginnings of queues are rounded down to multiples of this."""
 
 
 @frozen
@@ -83,6 +86,17 @@ class Stage:
         """Open lanes that end with the stage while others continue."""
         return self.lanes - self.through_lanes
 
+    def needs_same_moves(self, other: Stage) -> bool:
+        """Return whether a formation in either stage has the same lanes and as much time."""
+        ends = (self.to_m, self.is_last, self.structure, self.lanes, self.through_lanes)
+        return ends == (
+            other.to_m,
+            other.is_last,
+            other.structure,
+            other.lanes,
+            other.through_lanes,
+        )
+
     def goal_lanes(self, preferred_lane: int, destination: str = END_OF_ROAD) -> frozenset[int]:
         """Return the lanes in one of which a vehicle should be at the end of the stage.
 
@@ -128,8 +142,8 @@ def stages(scenario: Scenario, closed: tuple[TemporaryClosure, ...] = ()) -> tup
     """Return the stages of formations, from the start of the road to its end.
 
     Before a part that is closed for a time, vehicles change lanes from the start of the road on:
-    before S3 into any lane that goes on, otherwise to sort. Structures are formed only behind all
-    of these parts.
+    into any lane that goes on, or, if less than `SORTING_M` is left from there on, to sort.
+    Structures are formed only behind all of these parts.
 
     Args:
         scenario: road, structures.
@@ -215,7 +229,7 @@ def with_queues(
         census: vehicles on the road.
         scenario: road.
     """
-    parts = sorted(closed)
+    parts, longest_m = sorted(closed), scenario.types.longest_body_m
     off_lattice = [entry.off_lattice for entry in census.on_road if entry.off_lattice is not None]
     waiting = [body for body in off_lattice if _goes_on(body, scenario)]
     with_their_queues = list[TemporaryClosure]()
@@ -225,7 +239,7 @@ def with_queues(
             QUEUE_M * math.floor(body.rear_m / QUEUE_M)
             for body in waiting
             if body.lane == part.lane
-            and max(passed_m, default=-math.inf) <= body.rear_m < part.from_m
+            and max(passed_m, default=-math.inf) <= body.rear_m < part.from_m - longest_m
         ]
         known = part._replace(from_m=min(queue_m), late_m=0.0) if queue_m else part
         with_their_queues.append(known)

@@ -172,19 +172,21 @@ class LaneEndControl:
                 # Parts that are closed for a time come and go ahead of it.
                 lane, s_m = controller.hold_cell[1], vehicle.state[0]
                 self._end_of[name] = self._end_ahead(lane, s_m)
-        for at, gaps in sorted(self._gaps.items(), key=lambda each: -each[0][1]):
+        # In a lane, gaps for those ahead come first.
+        for at, gaps in sorted(self._gaps.items(), key=lambda each: (each[0][0], -each[0][1])):
             startable = self._startable(at, vehicles)
-            if startable and not self._waits_ahead(startable[0], at, vehicles):
+            if startable and not self._blocking(startable[0], at, vehicles):
                 usable = [gap for gap in gaps if self._may_take(gap, at, startable[0])]
                 yield from self._start(startable[0], usable, t_s)
                 startable = self._startable(at, vehicles)
             yield from self._arrive(gaps, vehicles, t_s)
-            if startable and False in self._waits_ahead(startable[0], at, vehicles):
+            blocking = self._blocking(startable[0], at, vehicles) if startable else []
+            if not all(self._may_start(its_end, one) for its_end, one in blocking):
                 startable = []
             last_m = max([self._ends[at].line_m, *(one.state[0] for one in startable[:1])])
             gaps[:] = [gap for gap in gaps if gap.vehicle or not self._is_over(gap, last_m, t_s)]
             free = [gap for gap in gaps if gap.vehicle is None]
-            ahead_m = -math.inf
+            ahead_m = min((one.state[0] for _, one in blocking), default=-math.inf)
             for vehicle in startable:
                 own = next((gap for gap in free if self._may_take(gap, at, vehicle)), None)
                 if own is None:
@@ -335,21 +337,21 @@ class LaneEndControl:
         """Return the vehicles that may start from where they wait, foremost first."""
         return [one for one in self._waiting(at, vehicles) if self._may_start(at, one)]
 
-    def _waits_ahead(
+    def _blocking(
         self, vehicle: RoadVehicle, at: LanePosition, vehicles: Mapping[Name, RoadVehicle]
-    ) -> set[bool]:
-        """Return whether vehicles that wait ahead of one may start themselves.
+    ) -> list[tuple[LanePosition, RoadVehicle]]:
+        """Return the vehicles that leave one no room to start, with the dead ends they wait at.
 
-        These are the vehicles at this dead end or the next ones that leave it no room to start.
+        They wait ahead of it, at the same dead end or the next ones.
         """
         s_m = vehicle.state[0]
-        return {
-            self._may_start(other, one)
-            for other in self._ends
-            if other[0] == at[0]
-            for one in self._waiting(other, vehicles)
+        return [
+            (its_end, one)
+            for its_end in self._ends
+            if its_end[0] == at[0]
+            for one in self._waiting(its_end, vehicles)
             if one.state[0] > s_m and one.state[0] - one.size[0] - s_m < self._room_m
-        }
+        ]
 
     def _waiting(self, at: LanePosition, vehicles: Mapping[Name, RoadVehicle]) -> list[RoadVehicle]:
         """Return the vehicles that wait at a dead end, foremost first."""
