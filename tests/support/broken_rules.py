@@ -15,12 +15,12 @@ from laneweave.coordinator.election import Election
 from laneweave.coordinator.formations import operation
 from laneweave.coordinator.formations.leader import FormationLeader
 from laneweave.coordinator.formations.roster import Formation, Groups
+from laneweave.coordinator.formations.stages import Stage
 from laneweave.coordinator.rolling import transfer
 from laneweave.coordinator.rolling.ownership import States
 from laneweave.coordinator.rolling.transfer import CellTransfer
 from laneweave.launch.fault_search.road.drawn_entrance import DrawnBlocks
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.road_layout import TemporaryClosure
 from laneweave.protocol.runtime.node import Effect
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.state_machine import Transition
@@ -317,12 +317,12 @@ def close_at_once(
     t_s: float,
     scenario: Scenario,
     groups: Groups,
-    parts: tuple[TemporaryClosure, ...] = (),
+    of_road: Sequence[Stage] = (),
 ) -> dict[int, Formation]:
     blocks = sorted({scenario.lattice.block_of(entry.cell[0]) for entry in census.on_road})
     closed = tuple(ClosedFormation(block, block, 0.0) for block in blocks)
     early = replace(census, formations=closed, closed_to=FAR_BEHIND)
-    return closed_formations(early, t_s, scenario, groups, parts)
+    return closed_formations(early, t_s, scenario, groups, of_road)
 
 
 def close_early(patch: Patch) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 
 from attrs import evolve
 
@@ -17,7 +17,7 @@ from laneweave.coordinator.formations.roster import (
     joinable,
     stage_begin_s,
 )
-from laneweave.coordinator.formations.stages import stages, with_queues
+from laneweave.coordinator.formations.stages import Stage, stages, with_queues
 from laneweave.coordinator.operation import LogEntry, to_vehicle
 from laneweave.coordinator.planning.response import PlanFunction
 from laneweave.protocol.road_layout import TemporaryClosure, TemporaryParts
@@ -65,6 +65,7 @@ class FormationsOperation:
         self._rules = rules
         self._groups = Groups()
         self._closed: tuple[TemporaryClosure, ...] = ()
+        """Parts of lanes that are closed for a time, or about to be closed."""
         self._planner = FormationPlanner(scenario, self._groups, self.leaders, new_job, plan)
 
     def forget(self) -> None:
@@ -131,12 +132,14 @@ class FormationsOperation:
                 yield LogEntry(VEHICLES_AWAITED, data | {"phase": leader.phase.value})
 
     def _update_members(self, census: Census, t_s: float, now_s: float) -> Iterator[LogEntry]:
-        formations = closed_formations(census, t_s, self._scenario, self._groups, self._closed)
-        for numbers in joinable(formations, t_s, self._scenario):
-            self._groups.join(numbers)
+        scenario, groups = self._scenario, self._groups
+        of_road = stages(scenario, with_queues(self._closed, census, scenario))
+        formations = closed_formations(census, t_s, scenario, groups, of_road)
+        for numbers in joinable(formations, t_s, scenario):
+            groups.join(numbers)
             yield LogEntry(FORMATIONS_JOINED, {"formations": list(numbers), "why": "room"})
-            formations = closed_formations(census, t_s, self._scenario, self._groups, self._closed)
-        self._groups.forget_departed(census, self._scenario.lattice.block_of)
+            formations = closed_formations(census, t_s, scenario, groups, of_road)
+        groups.forget_departed(census, scenario.lattice.block_of)
         for number in set(self.leaders) - set(formations):
             del self.leaders[number]
         for number, formation in formations.items():
@@ -145,24 +148,22 @@ class FormationsOperation:
                 self.leaders[number] = self._lead_formation(formation, t_s, now_s)
                 self._reconsider_neighbours(formation)
             else:
-                known = formation
-                if formation.stage != leader.formation.stage:
-                    known = self._with_stage(formation, leader, census, t_s)
+                known = self._with_stage(formation, leader, of_road, t_s)
                 leader.on_members(known, now_s)
 
     def _with_stage(
-        self, formation: Formation, leader: FormationLeader, census: Census, t_s: float
+        self, formation: Formation, leader: FormationLeader, of_road: Sequence[Stage], t_s: float
     ) -> Formation:
         """Return a formation with the stage of its leader, if that needs no other plan.
 
         Parts that are closed for a time change the stages of formations that have passed them, and
-        of those that need the same lanes as before. And where it is too late for a new plan, the
-        one in force would only be lost.
+        of those that need the same lanes as before. Where it is too late for a new plan, a new
+        ballot would only end the one in force.
         """
         stage, before = formation.stage, leader.formation
-        goals, closed = before.goal_lanes, with_queues(self._closed, census, self._scenario)
+        goals = before.goal_lanes
         if (
-            before.stage in stages(self._scenario, closed)
+            before.stage in of_road
             or formation.sorts != before.sorts
             or not formation.goal_lanes.keys() <= goals.keys()
         ):

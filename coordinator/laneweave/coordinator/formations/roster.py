@@ -19,9 +19,8 @@ from itertools import pairwise
 
 from attrs import define, field, frozen
 
-from laneweave.coordinator.formations.stages import WHOLE_ROAD, Stage, stages, with_queues
+from laneweave.coordinator.formations.stages import WHOLE_ROAD, Stage, stages
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.road_layout import TemporaryClosure
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.wire.messages import Census, CensusEntry, Name
 
@@ -117,7 +116,7 @@ def closed_formations(
     t_s: float,
     scenario: Scenario,
     groups: Groups,
-    parts: Iterable[TemporaryClosure] = (),
+    of_road: Sequence[Stage] = (),
 ) -> dict[int, Formation]:
     """Return the closed formations on the road by their lowest block number.
 
@@ -129,9 +128,9 @@ def closed_formations(
         t_s: road time.
         scenario: lattice, structures.
         groups: blocks planned together; the blocks of each closed formation are merged here.
-        parts: parts of lanes that are closed for a time.
+        of_road: stages of the road as it is now; empty: no part is closed for a time.
     """
-    lattice, of_road = scenario.lattice, stages(scenario, with_queues(parts, census, scenario))
+    lattice, of_road = scenario.lattice, of_road or stages(scenario)
     closed_s: dict[int, list[float]] = {}
     for closed in census.formations:
         groups.join(closed.blocks)
@@ -180,9 +179,12 @@ def stage_at(numbers: Numbers, t_s: float, of_road: Sequence[Stage], scenario: S
 
 def stage_begin_s(numbers: Numbers, stage: Stage, scenario: Scenario) -> float:
     """Return the road time at which all bodies in some blocks have passed the start of a stage."""
-    lattice, from_m = scenario.lattice, stage.from_m
-    rear = lattice.block_range(numbers[-1])[0]
-    return lattice.passing_time_s(rear, from_m + scenario.types.longest_body_m)
+    return _all_pass_s(numbers, stage.from_m, scenario)
+
+
+def _all_pass_s(numbers: Numbers, position_m: float, scenario: Scenario) -> float:
+    rear = scenario.lattice.block_range(numbers[-1])[0]
+    return scenario.lattice.passing_time_s(rear, position_m + scenario.types.longest_body_m)
 
 
 def stage_end_s(numbers: Numbers, stage: Stage, scenario: Scenario) -> float:
@@ -193,8 +195,7 @@ def stage_end_s(numbers: Numbers, stage: Stage, scenario: Scenario) -> float:
     """
     lattice = scenario.lattice
     if stage.structure is not None:
-        begins_m = stage.to_m + scenario.types.longest_body_m
-        return lattice.passing_time_s(lattice.block_range(numbers[-1])[0], begins_m) - STAGE_LEAD_S
+        return _all_pass_s(numbers, stage.to_m, scenario) - STAGE_LEAD_S
     rear, front = lattice.block_range(numbers[-1])[0], lattice.block_range(numbers[0])[-1]
     return lattice.passing_time_s(front if stage.is_last else rear, stage.to_m)
 

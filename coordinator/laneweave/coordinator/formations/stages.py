@@ -14,7 +14,7 @@ Parts of lanes that are closed for a time add stages in which vehicles leave the
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Sequence
 from functools import cached_property, lru_cache
 from itertools import pairwise
 from operator import itemgetter
@@ -34,7 +34,7 @@ from laneweave.protocol.vehicle.lane_ends import sections_to_lines
 from laneweave.protocol.wire.messages import Census, OffLattice
 
 SORTING_M = 300.0
-"""Length of road in which a formation can sort its lanes: S3 of the paper, Section 6.2."""
+"""Length of road behind the line of a closed part in which a formation can sort its lanes."""
 QUEUE_M = 50.0
 """Beginnings of queues are rounded down to multiples of this."""
 
@@ -59,7 +59,7 @@ class Stage:
     sorted_before: bool = field(default=False, eq=False)
     """Whether lanes are sorted in an earlier stage."""
     avoids: bool = False
-    """Whether vehicles need any lane that goes on, since they sort in a later stage."""
+    """Whether any lane that goes on will do, since vehicles sort in a later stage."""
 
     @cached_property
     def open_sections(self) -> list[tuple[LaneSection, float]]:
@@ -87,15 +87,12 @@ class Stage:
         return self.lanes - self.through_lanes
 
     def needs_same_moves(self, other: Stage) -> bool:
-        """Return whether a formation in either stage has the same lanes and as much time."""
-        ends = (self.to_m, self.is_last, self.structure, self.lanes, self.through_lanes)
-        return ends == (
-            other.to_m,
-            other.is_last,
-            other.structure,
-            other.lanes,
-            other.through_lanes,
-        )
+        """Return whether both stages leave a formation the same lanes, and the same time."""
+        return self._open_until == other._open_until
+
+    @property
+    def _open_until(self) -> tuple[object, ...]:
+        return self.to_m, self.is_last, self.structure, self.lanes, self.through_lanes
 
     def goal_lanes(self, preferred_lane: int, destination: str = END_OF_ROAD) -> frozenset[int]:
         """Return the lanes in one of which a vehicle should be at the end of the stage.
@@ -153,16 +150,16 @@ def stages(scenario: Scenario, closed: tuple[TemporaryClosure, ...] = ()) -> tup
     passed_m = max((one.to_m for one in closed), default=0.0)
     structures = [one for one in scenario.formation.structures if one.from_m >= passed_m]
     formed_m = pairwise([*(one.from_m for one in structures), start_m])
+    sections = cut(scenario.geometry.sections, closed)
+    lines_m = [one.to_m for one in sections_to_lines(scenario, closed)]
     parts = [
         *((*each_m, one, False) for each_m, one in zip(formed_m, structures, strict=True)),
         *(
             (from_m, to_m, None, sudden and to_m <= max(start_m, road_m - SORTING_M))
-            for from_m, to_m, sudden in _sorting_m(scenario, closed)
+            for from_m, to_m, sudden in _sorting_stages(scenario, closed, sections, lines_m)
         ),
     ]
     parts.sort(key=itemgetter(0))
-    sections = cut(scenario.geometry.sections, closed)
-    lines_m = [one.to_m for one in sections_to_lines(scenario, closed)]
     made = list[Stage]()
     for from_m, to_m, structure, avoids in parts:
         # What lies behind a formation does not change its stage.
@@ -186,13 +183,21 @@ def _begun(section: LaneSection, from_m: float) -> LaneSection:
     return evolve(section, from_m=begins_m, moves_from_m=moves_from_m)
 
 
-def _sorting_m(
-    scenario: Scenario, closed: tuple[TemporaryClosure, ...]
+def _sorting_stages(
+    scenario: Scenario,
+    closed: Sequence[TemporaryClosure],
+    sections: Sequence[LaneSection],
+    lines_m: Sequence[float],
 ) -> Iterator[tuple[float, float, bool]]:
-    """Yield stages in which lanes change: begin, end, whether a part ends them for a time."""
+    """Yield each stage in which lanes are changed: its begin and end, and if a closed part ends it.
+
+    Args:
+        scenario: road.
+        closed: parts that are closed for a time.
+        sections: those of the road, cut at these parts.
+        lines_m: their lines.
+    """
     road, always = scenario.road, len(scenario.geometry.sections)
-    sections = cut(scenario.geometry.sections, closed)
-    lines_m = [one.to_m for one in sections_to_lines(scenario, closed)]
     ends_m, sudden_m = {*lines_m, road.length_m}, {*lines_m[always:]}
     begin_m = {max(one.from_m, one.moves_from_m) for one in sections}
     from_m = 0.0
@@ -217,7 +222,7 @@ def shortest_m(scenario: Scenario) -> float:
 
 
 def with_queues(
-    closed: Iterable[TemporaryClosure], census: Census, scenario: Scenario
+    closed: Sequence[TemporaryClosure], census: Census, scenario: Scenario
 ) -> tuple[TemporaryClosure, ...]:
     """Return parts that are closed for a time, with the vehicles that wait before them.
 
@@ -229,9 +234,10 @@ def with_queues(
         census: vehicles on the road.
         scenario: road.
     """
+    if not closed:
+        return ()  # as in nearly every tick
     parts, longest_m = sorted(closed), scenario.types.longest_body_m
-    off_lattice = [entry.off_lattice for entry in census.on_road if entry.off_lattice is not None]
-    waiting = [body for body in off_lattice if _goes_on(body, scenario)]
+    waiting = [body for body in census.off_lattice if _goes_on(body, scenario)]
     with_their_queues = list[TemporaryClosure]()
     for part in parts:
         passed_m = [one.to_m for one in parts if one.lane == part.lane and one.to_m <= part.from_m]

@@ -124,9 +124,7 @@ class KnownRoad:
             if ends_m:
                 from_m = min(max(section.from_m, max(ends_m) + jump_m), section.to_m)
                 sections[number] = evolve(section, from_m=from_m)
-        on_road = census.on_road
-        bodies = [entry.off_lattice for entry in on_road if entry.off_lattice is not None]
-        bodies += census.ends
+        bodies = (*census.off_lattice, *census.ends)
         for number, section in enumerate(sections):
             inside = [
                 body.rear_m

@@ -125,7 +125,7 @@ class Facts:
     never_attended: bool = False
     """Whether its agent did not start in time."""
     closed: ClosedParts = field(factory=ClosedParts)
-    """The closed parts that had begun when the facts end."""
+    """Closed parts that began before the end of the facts."""
     refused: list[Event] = field(factory=list)
     """Processes whose settings were refused."""
     leader_gaps: list[tuple[float, float]] = field(factory=list)

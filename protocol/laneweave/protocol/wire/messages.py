@@ -431,6 +431,12 @@ class Census(Message, frozen=True):
         """The vehicles that have cells."""
         return tuple(entry for entry in self.on_road if entry.off_lattice is None)
 
+    @property
+    def off_lattice(self) -> tuple[OffLattice, ...]:
+        """The bodies of the vehicles that have no cells."""
+        bodies = (entry.off_lattice for entry in self.on_road)
+        return tuple(body for body in bodies if body is not None)
+
 
 class RoadClock(Message, frozen=True):
     """Bridge to coordinators and observers, each tick: road time and progress.

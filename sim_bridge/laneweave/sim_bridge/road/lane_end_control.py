@@ -119,7 +119,9 @@ class LaneEndControl:
             self._columns, self._room_m = needed.columns, needed.room_m
             self._distance_m = needed.distance_m
         self._sections = sections_to_lines(scenario, closed) if self._ends else ()
-        before, self._gaps = self._gaps, {at: [] for at in self._ends}
+        # In a lane, those ahead get gaps first.
+        farthest_first = sorted(self._ends, key=lambda at: (at[0], -at[1]))
+        before, self._gaps = self._gaps, {at: [] for at in farthest_first}
         for at, gaps in before.items():
             merged = self._merged(at)
             if merged is not None:
@@ -172,8 +174,7 @@ class LaneEndControl:
                 # Parts that are closed for a time come and go ahead of it.
                 lane, s_m = controller.hold_cell[1], vehicle.state[0]
                 self._end_of[name] = self._end_ahead(lane, s_m)
-        # In a lane, gaps for those ahead come first.
-        for at, gaps in sorted(self._gaps.items(), key=lambda each: (each[0][0], -each[0][1])):
+        for at, gaps in self._gaps.items():
             startable = self._startable(at, vehicles)
             if startable and not self._blocking(startable[0], at, vehicles):
                 usable = [gap for gap in gaps if self._may_take(gap, at, startable[0])]
@@ -240,8 +241,8 @@ class LaneEndControl:
         crowded = any(arrival.entry_point in taken for arrival in self._meter.waiting)
         between = (CROWDED_GAPS if crowded else OPEN_GAPS) * self._columns
         if own:
-            # Others enter the lane only behind it. Its gap reaches it after the vehicle ahead has
-            # started, which the gap before passes later the farther ahead that vehicle waits.
+            # Others enter the lane only behind it. The vehicle ahead must have started before the
+            # gap arrives. The gap before needs the longer to that vehicle the farther ahead it is.
             between = math.ceil(max(ahead_m - vehicle.state[0], 0.0) / self._lattice.pitch_m)
         last = self._last_gap_column.get(point, math.inf)
         if self._meter.next_column(point) < last - between:
@@ -340,7 +341,7 @@ class LaneEndControl:
     def _blocking(
         self, vehicle: RoadVehicle, at: LanePosition, vehicles: Mapping[Name, RoadVehicle]
     ) -> list[tuple[LanePosition, RoadVehicle]]:
-        """Return the vehicles that leave one no room to start, with the dead ends they wait at.
+        """Return the vehicles that leave a vehicle no room to start, with their dead ends.
 
         They wait ahead of it, at the same dead end or the next ones.
         """

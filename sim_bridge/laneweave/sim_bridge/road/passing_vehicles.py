@@ -101,7 +101,7 @@ class PassingVehicle:
 
     @property
     def has_cell(self) -> bool:
-        """Whether it is on the lattice or needs no cell: always."""
+        """Whether it has a cell, or needs none: always."""
         return True
 
     @property

@@ -100,7 +100,7 @@ class RoadVehicle:
 
     @property
     def lanes_touched(self) -> range:
-        """Lanes in which corners of the body are, with its heading."""
+        """Lanes that the body touches, with its heading taken into account."""
         lattice = self.controller.lattice
         ys_m = [y_m for _, y_m in corners(pose_of(self.state), *self.size)]
         right_m, left_m = min(ys_m), max(ys_m)

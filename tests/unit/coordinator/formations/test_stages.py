@@ -217,7 +217,7 @@ def test_structures_are_formed_only_behind_closed_parts() -> None:
 
 
 def waiting(*bodies: tuple[int, float]) -> Census:
-    """Return a census with vehicles without cells in a lane, whose rears are at a position."""
+    """Return a census of vehicles without cells, each given by its lane and its rear."""
     entries = (
         CensusEntry(Name(f"v{number}"), (0, lane), 0, 0.0, OffLattice(lane, rear_m))
         for number, (lane, rear_m) in enumerate(bodies)
@@ -253,6 +253,7 @@ def test_with_all_lanes_closed_formations_still_have_stages() -> None:
         [TemporaryClosure(lane, 300.0, 600.0) for lane in range(3)], waiting(), scenario
     )
     found = stages(scenario, parts)
+    assert found
     assert all(stage.lanes and stage.goal_lanes(1) for stage in found)
 
 
