@@ -28,6 +28,7 @@ if __name__ == "__main__":  # same paths as `pythonpath` in pyproject.toml
 
 import laneweave
 import roads
+import surprises
 from api_reference import api_reference, documented
 from command_reference import command_reference
 from conflict_drawing import counts, draw_conflicts
@@ -102,6 +103,8 @@ LONG = DOCS / "evidence" / "long-run.json"
 """Memory of long runs, by `benchmarks/long_run.py`."""
 STABILITY = DOCS / "evidence" / "stability.json"
 """Output of `benchmarks/stability.py`."""
+SURPRISES = DOCS / "evidence" / "surprises.json"
+"""Output of `benchmarks/surprises.py`."""
 DECISIONS = DOCS / "adr"
 SCENARIO = DOCS / "SCENARIO.md"
 CONFLICTS = DOCS / "images" / "conflict-table.png"
@@ -789,6 +792,35 @@ def _stability() -> str:
     return "\n".join(lines)
 
 
+def _surprises() -> str:
+    """Return the table of runs with surprises, by `benchmarks/surprises.py`."""
+    headings = (
+        "surprise", "veh/(lane h)", "method", "runs", "mean delay", "range", "stopped",
+        "in another lane", "overlaps", "acceleration", "flows freely again after",
+    )  # fmt: skip
+    lines = [f"| {' | '.join(headings)} |", "|---" * len(headings) + "|"]
+    rows = json.loads(SURPRISES.read_text(encoding="utf-8")).values()
+    for point in surprises.POINTS:
+        runs = [row for row in rows if row["point"] == point.name]
+        if not runs:
+            continue
+        delays_s = [run["delay_s"] for run in runs]
+        free_s = [run["free_again_s"] for run in runs]
+        free = "no" if None in free_s else f"{max(free_s):.0f} s"
+        lossy = f", {100 * point.loss:g} % loss" if point.loss else ""
+        others = sum(run["in_another_lane"] for run in runs)
+        lines.append(
+            f"| {point.surprise}{lossy} | {point.volume} | {point.label} | {len(runs)} "
+            f"| {fmean(delays_s):z.1f} s | {min(delays_s):z.1f} to {max(delays_s):z.1f} s "
+            f"| {sum(run['stopped'] for run in runs)} "
+            f"| {others} of {sum(run['left'] for run in runs):,} "
+            f"| {sum(run['overlaps'] for run in runs)} "
+            f"| {min(run['min_accel_mps2'] for run in runs):.1f} m/s2 "
+            f"| {free if point.surprise != 'none' else ''} |"
+        )
+    return "\n".join(lines)
+
+
 def _service_added(runs: list[dict[str, Any]]) -> Iterator[str]:
     yield "| at half load | requests | solving p50 / p99 | added p50 / p95 / p99 |"
     yield "|---|---|---|---|"
@@ -877,6 +909,7 @@ def parts() -> dict[str, str]:
         "closing": _closing(),
         "service": _service(),
         "stability": _stability(),
+        "surprises": _surprises(),
         "stream": _stream(),
         "roads": _road_results(faults=False),
         "roads under faults": _road_results(faults=True),

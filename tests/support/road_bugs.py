@@ -147,7 +147,7 @@ def keeps_its_cells(leave_lattice: Call, self: MotionController) -> None:
 def gap_is_entered(patch: Patch) -> None:
     """The entry meter only says that it keeps columns free, and sensors are not asked."""
 
-    def keep_free(self: EntryMeter, lane: int, count: int, _: object) -> range:
+    def keep_free(self: EntryMeter, lane: int, count: int, *_: object, **__: object) -> range:
         return range(self._columns[lane] - count + 1, self._columns[lane] + 1)
 
     patch.setattr(LaneEndControl, "_is_free", lambda *_: True)

@@ -340,7 +340,8 @@ class OffLattice(Message, frozen=True):
     lane: Int64
     """Lane in which it is; usually one that ends, which it has not left in time."""
     rear_m: Real
-    """Position of its rear bumper [m]."""
+    """Position of its rear bumper, or where that will stand; the end of the road: it is about to
+    get cells in this lane [m]."""
 
 
 class CensusEntry(Message, frozen=True):

@@ -32,6 +32,7 @@ from __future__ import annotations
 
 import math
 from bisect import insort
+from collections import deque
 from collections.abc import Callable, Collection, Sequence
 
 from attrs import frozen
@@ -42,6 +43,8 @@ from laneweave.protocol.scenario.road_tables import EntryPoint
 from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.road.formation_building import FormationBuilder
 
+LOAD_S = 60.0
+"""Time over which the number of vehicles in a column is averaged."""
 _MAX_KEEPING_COLUMNS = 4096
 """Number of columns, more than there are on a road, whose vehicles are remembered."""
 TIME_TOLERANCE_S = 1e-9
@@ -141,6 +144,8 @@ class EntryMeter:
         lanes kept free; None: any number."""
         self._in_column: dict[int, int] = {}
         """This number by column, as long as vehicles may enter there."""
+        self._entered_s: deque[float] = deque()
+        """Times at which vehicles have entered at the start of the road, up to `LOAD_S` ago."""
         self._until_s = -math.inf
         """Time after which the next vehicles enter."""
         self._free_s = [-math.inf] * len(points)
@@ -164,17 +169,32 @@ class EntryMeter:
             if entry_m <= 0.0
         )
 
-    def keep_free(self, point: int, count: int, t_s: float) -> range:
-        """Return the next columns of an entry point, which no vehicle may enter any more."""
+    def keep_free(self, point: int, count: int, t_s: float, *, passes_parts: bool = True) -> range:
+        """Return the next columns of an entry point, which no vehicle may enter any more.
+
+        Args:
+            point: index of the entry point.
+            count: number of columns.
+            t_s: road time.
+            passes_parts: whether its lane is one in which others pass closed parts of lanes, so
+                that the columns have less room for them (`most_in_column`).
+        """
         first = self.next_column(point)
         if self._builder is not None:
             return self._builder.reserve(first, count, t_s)
         self._columns[point] = first - count
         kept = range(first - count + 1, first + 1)
-        if self._entry_m[point] <= 0.0:
+        if passes_parts and self._entry_m[point] <= 0.0:
             for column in kept:
                 self._count_in(column)
         return kept
+
+    def vehicles_in_column(self, t_s: float) -> float:
+        """Return the mean number of vehicles of a column that entered at the start of the road."""
+        entered_s, lattice = self._entered_s, self._lattice
+        while entered_s and entered_s[0] < t_s - LOAD_S:
+            entered_s.popleft()
+        return len(entered_s) * lattice.pitch_m / (lattice.speed_mps * LOAD_S)
 
     def points_kept_free(self, point: int) -> Collection[int]:
         """Return the entry points at which `keep_free` keeps columns free: with formations, all."""
@@ -249,6 +269,8 @@ class EntryMeter:
                 offset_m = late_s * self._lattice.speed_mps
                 cell, more_cells = (column, arrival.lane), self.exit_cells(arrival, column)
                 admissions.append(Admission(arrival, cell, t_s, offset_m, more_cells))
+                if self._entry_m[point] <= 0.0:
+                    self._entered_s.append(t_s)
                 self._free_s[point] = t_s + self._lattice.pitch_m / self._lattice.speed_mps
             self._columns[point] -= 1
         self._until_s = until_s + TIME_TOLERANCE_S

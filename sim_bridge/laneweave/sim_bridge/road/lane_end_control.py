@@ -48,7 +48,11 @@ from laneweave.sim_bridge.road.vehicle import RoadVehicle
 OPEN_GAPS, CROWDED_GAPS = 1, 5
 """Number of gap lengths of columns between two gaps of a lane that vehicles may enter, so that its
 traffic, and vehicles that change into it, keep most of its cells; and the same while vehicles wait
-at the entrance of the lane. With fewer, gaps would use up the capacity of dense traffic."""
+at the entrance of the lane, or, while a part is closed for a time, of any. With fewer, gaps would
+use up the capacity of dense traffic."""
+USED_SHARE = 0.8
+"""Share of the cells past closed parts that vehicles and gaps use together. With more, vehicles
+find no way out of the closed lane, stop, and need gaps in turn."""
 
 
 @define
@@ -197,21 +201,28 @@ class LaneEndControl:
                 ahead_m = vehicle.state[0]
 
     def bodies(self, vehicles: Mapping[Name, RoadVehicle]) -> dict[Name, OffLattice]:
-        """Return the lane and the rear of each vehicle without cells.
+        """Return the lane and the rear of each vehicle without cells, as far as plans avoid them.
 
-        A vehicle that still drives up to its line counts as where it will stand.
+        A vehicle that still drives up to its line counts as where it will stand. One that re-enters
+        counts as at the end of the road once it is in its new lane: nobody is led into its gap, and
+        those behind the gap will never be nearer to it.
         """
         found: dict[Name, OffLattice] = {}
         for at, end in self._ends.items():
             for number, vehicle in enumerate(self._waiting(at, vehicles)):
-                stands_m = end.line_m - number * self._queue_m
-                rear_m = max(vehicle.state[0], stands_m) - vehicle.size[0]
+                front_m, speed_mps = vehicle.state[:2]
+                if speed_mps > STANDING_MPS or not vehicle.controller.stays:
+                    front_m = max(front_m, end.line_m - number * self._queue_m)
+                rear_m = front_m - vehicle.size[0]
                 found[vehicle.name] = OffLattice(end.lane, rear_m)
         for name in self._end_of:
             if name in vehicles and name not in found:
-                s_m, _, _, y_m, _, _ = vehicles[name].state
-                lane = int(y_m // self._lattice.lane_width_m)
-                found[name] = OffLattice(lane, s_m - vehicles[name].size[0])
+                vehicle = vehicles[name]
+                rear_m, lane = vehicle.state[0] - vehicle.size[0], vehicle.body_lane
+                if vehicle.controller.off_lattice is OffLatticePhase.RE_ENTERING:
+                    in_gap = lane == vehicle.controller.hold_cell[1]
+                    rear_m = self._scenario.road.length_m if in_gap else rear_m
+                found[name] = OffLattice(lane, rear_m)
         return found
 
     def _request(
@@ -238,17 +249,35 @@ class LaneEndControl:
         # Behind the first entry point of the lane, vehicles may own its cells.
         point = lane
         taken = self._meter.points_kept_free(point)
-        crowded = any(arrival.entry_point in taken for arrival in self._meter.waiting)
-        between = (CROWDED_GAPS if crowded else OPEN_GAPS) * self._columns
+        between = self._columns_between_gaps(taken, t_s)
         if own:
             # Others enter the lane only behind it. The vehicle ahead must have started before the
             # gap arrives. The gap before needs the longer to that vehicle the farther ahead it is.
             between = math.ceil(max(ahead_m - vehicle.state[0], 0.0) / self._lattice.pitch_m)
         last = self._last_gap_column.get(point, math.inf)
         if self._meter.next_column(point) < last - between:
-            columns = self._meter.keep_free(point, self._columns, t_s)
+            columns = self._meter.keep_free(point, self._columns, t_s, passes_parts=not own)
             self._last_gap_column |= dict.fromkeys(taken, columns[0])
             gaps.append(Gap(lane, columns))
+
+    def _columns_between_gaps(self, points: Collection[int], t_s: float) -> float:
+        """Return the number of columns between two gaps of a lane.
+
+        See `CROWDED_GAPS` and `USED_SHARE`.
+
+        Args:
+            points: entry points whose vehicles cannot enter the columns of a gap.
+            t_s: road time.
+        """
+        least, most = OPEN_GAPS * self._columns, CROWDED_GAPS * self._columns
+        lanes = self._meter.most_in_column
+        if any(lanes is not None or one.entry_point in points for one in self._meter.waiting):
+            return most
+        if lanes is None:
+            return least
+        spare = USED_SHARE * lanes - self._meter.vehicles_in_column(t_s)
+        needed = self._columns / spare - self._columns if spare > 0.0 else math.inf
+        return min(max(needed, least), most)
 
     def _is_open(self, at: LanePosition, vehicle: RoadVehicle) -> bool:
         """Return whether a vehicle can drive on in its lane, beyond a dead end.
@@ -336,7 +365,11 @@ class LaneEndControl:
         self, at: LanePosition, vehicles: Mapping[Name, RoadVehicle]
     ) -> list[RoadVehicle]:
         """Return the vehicles that may start from where they wait, foremost first."""
-        return [one for one in self._waiting(at, vehicles) if self._may_start(at, one)]
+        return [
+            one
+            for one in self._waiting(at, vehicles)
+            if one.controller.broken_mps2 is None and self._may_start(at, one)
+        ]
 
     def _blocking(
         self, vehicle: RoadVehicle, at: LanePosition, vehicles: Mapping[Name, RoadVehicle]

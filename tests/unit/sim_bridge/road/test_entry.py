@@ -153,6 +153,22 @@ def test_a_late_demand_takes_no_column_that_has_passed() -> None:
     assert admission.t_s == 6.0
 
 
+@pytest.mark.parametrize(("passes_parts", "expected"), [(False, [0, 2]), (True, [0])])
+def test_a_gap_in_a_lane_past_a_closed_part_leaves_its_columns_less_room(
+    passes_parts: bool, expected: list[int]
+) -> None:
+    grid = lattice()
+    meter = EntryMeter(grid, 0.0)
+    meter.most_in_column = 2
+    kept = meter.keep_free(1, 1, 0.0, passes_parts=passes_parts)
+    for lane in (0, 2):
+        meter.demand(Arrival(f"v{lane}", lane, lane, 0.0))
+
+    entered = meter.admit(0.0)
+
+    assert [one.cell for one in entered] == [(kept.start, lane) for lane in expected]
+
+
 def test_impossible_demands_are_refused() -> None:
     meter = interlaced_meter(lattice())
     meter.demand(Arrival("twice", 0, 0, 0.0))

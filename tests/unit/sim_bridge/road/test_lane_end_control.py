@@ -12,7 +12,7 @@ from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.road_tables import Closure, Demand
 from laneweave.protocol.vehicle.lane_ends import dead_ends, re_entry
 from laneweave.protocol.wire.events import DRIVES_OUT, ENTERED_LATTICE, LEFT_LATTICE
-from laneweave.protocol.wire.messages import Name
+from laneweave.protocol.wire.messages import Name, OffLattice
 from laneweave.sim_bridge.bodies.motion_controller import FallbackLevel
 from laneweave.sim_bridge.road.entry import EntryMeter
 from support import road_bugs
@@ -121,6 +121,24 @@ def test_the_census_tells_where_they_stand() -> None:
             assert body.rear_m == pytest.approx(rear_m, abs=8.0)
 
 
+def test_plans_may_follow_a_vehicle_that_re_enters() -> None:
+    """Its lane does not end for those behind its gap, once its body is in it."""
+    road = lonely_road(DROP, 40.0, 100.0)
+    told: list[tuple[int, OffLattice]] = []
+    while ENTERED_LATTICE not in {kind for _, kind, _ in road.events}:
+        road.step()
+        census = road.roadside.publisher.census(road.t_s, road.vehicles.values())
+        for vehicle in road.vehicles.values():
+            if vehicle.re_enters:
+                (body,) = census.off_lattice
+                rear_m = vehicle.state[0] - vehicle.size[0]
+                told.append((vehicle.body_lane, body))
+                in_gap = vehicle.body_lane == 1
+                expected_m = DROP.road.length_m if in_gap else pytest.approx(rear_m)
+                assert (body.lane, body.rear_m) == (vehicle.body_lane, expected_m)
+    assert {lane for lane, _ in told} == {0, 1}
+
+
 @pytest.mark.parametrize(
     "blind",
     [
@@ -159,7 +177,9 @@ def test_one_gap_for_each_vehicle() -> None:
     asked = []
     keep_free = EntryMeter.keep_free
     road.roadside._lane_ends._meter = meter = road.roadside._meter
-    meter.keep_free = lambda lane, *more: asked.append(lane) or keep_free(meter, lane, *more)  # type: ignore[method-assign, func-returns-value]
+    meter.keep_free = lambda lane, *more, **named: (  # type: ignore[method-assign]
+        asked.append(lane) or keep_free(meter, lane, *more, **named)  # type: ignore[func-returns-value]
+    )
     while road.vehicles or not road.roadside.demand.exhausted(road.t_s):
         road.step()
     out = [one for _, kind, one in road.events if kind == DRIVES_OUT]

@@ -116,6 +116,15 @@ def test_a_vehicle_that_breaks_down_is_an_obstacle_until_all_have_passed_it(
     assert obstacle.vehicle in names(road, LEFT_LATTICE)
 
 
+def test_no_gap_is_kept_free_for_a_vehicle_before_it_is_repaired() -> None:
+    road = lonely_road(BREAKS_DOWN)
+    while road.t_s < AT_S + STANDS_S:
+        road.step()
+        gaps = road.roadside._lane_ends._gaps.values()
+        assert LANE not in {gap.lane for each in gaps for gap in each}
+    assert names(road, LEFT_LATTICE)
+
+
 def test_the_vehicle_slows_down_as_given_stands_as_long_as_given_and_is_where_it_was_said() -> None:
     road = lonely_road(BREAKS_DOWN)
     stands_s = moves_s = math.nan
