@@ -191,10 +191,10 @@ class EntryMeter:
 
     def vehicles_in_column(self, t_s: float) -> float:
         """Return the mean number of vehicles of a column that entered at the start of the road."""
-        entered_s, lattice = self._entered_s, self._lattice
+        entered_s, column_s = self._entered_s, self._lattice.pitch_m / self._lattice.speed_mps
         while entered_s and entered_s[0] < t_s - LOAD_S:
             entered_s.popleft()
-        return len(entered_s) * lattice.pitch_m / (lattice.speed_mps * LOAD_S)
+        return len(entered_s) * column_s / max(column_s, min(t_s, LOAD_S))
 
     def points_kept_free(self, point: int) -> Collection[int]:
         """Return the entry points at which `keep_free` keeps columns free: with formations, all."""

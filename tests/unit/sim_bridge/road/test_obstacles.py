@@ -23,6 +23,7 @@ from laneweave.protocol.wire.events import (
 from laneweave.protocol.wire.messages import Name
 from laneweave.protocol.wire.obstacle_messages import BREAKDOWN, CLOSED, Obstacle
 from laneweave.sim_bridge.bodies.stop_lines import STANDING_MPS
+from laneweave.sim_bridge.road.lane_end_control import CROWDED_GAPS, OPEN_GAPS
 from laneweave.sim_bridge.road.obstacles import ActiveObstacle, Breakdown
 from support import road_bugs
 from support.bugs import Bug, catches
@@ -123,6 +124,22 @@ def test_no_gap_is_kept_free_for_a_vehicle_before_it_is_repaired() -> None:
         gaps = road.roadside._lane_ends._gaps.values()
         assert LANE not in {gap.lane for each in gaps for gap in each}
     assert names(road, LEFT_LATTICE)
+
+
+@pytest.mark.parametrize(
+    ("volume", "least", "most"),
+    [(600.0, OPEN_GAPS, OPEN_GAPS + 1), (1800.0, CROWDED_GAPS - 1, CROWDED_GAPS)],
+)
+def test_gaps_leave_cells_for_the_vehicles_that_pass(volume: float, least: int, most: int) -> None:
+    road = lonely_road(BREAKS_DOWN, volume=volume)
+    seen: set[range] = set()
+    while len(seen) < 2:
+        road.step()
+        gaps = road.roadside._lane_ends._gaps.values()
+        seen |= {gap.columns for each in gaps for gap in each}
+    ahead, behind = sorted(seen, key=lambda kept: -kept.start)
+    columns = re_entry(ROAD).columns
+    assert least * columns <= ahead.start - behind.stop <= most * columns
 
 
 def test_the_vehicle_slows_down_as_given_stands_as_long_as_given_and_is_where_it_was_said() -> None:
