@@ -32,7 +32,7 @@ class CensusPublisher:
         self,
         bridge: int,
         demand: DemandQueue,
-        off_lattice: Callable[[Mapping[Name, RoadVehicle]], Mapping[Name, OffLattice]],
+        off_lattice: Callable[[Mapping[Name, RoadVehicle], float], Mapping[Name, OffLattice]],
         outside: OutsideTraffic,
         closed_to: int,
     ) -> None:
@@ -118,7 +118,7 @@ class CensusPublisher:
         Vehicles at the entrance, which enter with the next tick, are announced.
         """
         vehicles = tuple(on_road)
-        off_lattice = self._off_lattice({vehicle.name: vehicle for vehicle in vehicles})
+        off_lattice = self._off_lattice({vehicle.name: vehicle for vehicle in vehicles}, t_s)
         # A formation without members on the lattice counts as deserted; others may have joined it.
         present = {one.formation for one in vehicles if one.has_cell}
         self._closed = [closed for closed in self._closed if closed.first_block in present]

@@ -35,6 +35,7 @@ from laneweave.protocol.vehicle.lane_ends import (
     re_entry,
     sections_to_lines,
 )
+from laneweave.protocol.vehicle.motion import ARRIVED_ALONG_M
 from laneweave.protocol.vehicle.sudden_stops import queue_pitch_m
 from laneweave.protocol.vehicle.territory import territory_of
 from laneweave.protocol.wire.events import DRIVES_OUT, ENTERED_LATTICE, LEFT_LATTICE, MISSED_EXIT
@@ -200,12 +201,12 @@ class LaneEndControl:
                 free.remove(own)
                 ahead_m = vehicle.state[0]
 
-    def bodies(self, vehicles: Mapping[Name, RoadVehicle]) -> dict[Name, OffLattice]:
+    def bodies(self, vehicles: Mapping[Name, RoadVehicle], t_s: float) -> dict[Name, OffLattice]:
         """Return the lane and the rear of each vehicle without cells, as far as plans avoid them.
 
         A vehicle that still drives up to its line counts as where it will stand. One that re-enters
-        counts as at the end of the road once it is in its new lane: nobody is led into its gap, and
-        those behind the gap will never be nearer to it.
+        counts as at the end of the road once it is in its new lane, unless it falls behind its gap:
+        nobody is led into the gap, and those behind it will never be nearer to the vehicle.
         """
         found: dict[Name, OffLattice] = {}
         for at, end in self._ends.items():
@@ -220,7 +221,9 @@ class LaneEndControl:
                 vehicle = vehicles[name]
                 rear_m, lane = vehicle.state[0] - vehicle.size[0], vehicle.body_lane
                 if vehicle.controller.off_lattice is OffLatticePhase.RE_ENTERING:
-                    in_gap = lane == vehicle.controller.hold_cell[1]
+                    column, its_lane = vehicle.controller.hold_cell
+                    least_m = self._lattice.cell_s_m(column, t_s) - ARRIVED_ALONG_M
+                    in_gap = lane == its_lane and vehicle.state[0] >= least_m
                     rear_m = self._scenario.road.length_m if in_gap else rear_m
                 found[name] = OffLattice(lane, rear_m)
         return found

@@ -139,6 +139,18 @@ def test_plans_may_follow_a_vehicle_that_re_enters() -> None:
     assert {lane for lane, _ in told} == {0, 1}
 
 
+def test_plans_do_not_follow_a_vehicle_that_falls_behind_its_gap() -> None:
+    road = lonely_road(DROP, 40.0, 100.0)
+    vehicles = road.vehicles.values()
+    while not any(one.re_enters and one.body_lane == 1 for one in vehicles):
+        road.step()
+    (vehicle,) = (one for one in vehicles if one.re_enters)
+    column, lane = vehicle.controller.hold_cell
+    vehicle.controller.hold_cell = (column + 12, lane)
+    (body,) = road.roadside.publisher.census(road.t_s, vehicles).off_lattice
+    assert body == OffLattice(1, pytest.approx(vehicle.state[0] - vehicle.size[0]))
+
+
 @pytest.mark.parametrize(
     "blind",
     [
