@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import random
 from collections.abc import Callable, Iterator, Sequence
 
@@ -29,6 +30,8 @@ from laneweave.protocol.wire.messages import Ballot, Census, VehicleState
 
 JUST_CLOSED_S = 1.0
 """Age (road time) up to which no leader can have planned for a closed formation."""
+HEED_S = 1.0
+"""Road time for which formations plan with the same closed parts once these have changed."""
 
 
 class FormationsOperation:
@@ -66,13 +69,23 @@ class FormationsOperation:
         self._groups = Groups()
         self._closed: tuple[TemporaryClosure, ...] = ()
         """Parts of lanes that are closed for a time, or about to be closed."""
+        self._heed_nothing()
         self._planner = FormationPlanner(scenario, self._groups, self.leaders, new_job, plan)
 
     def forget(self) -> None:
         """Discard all formations and all joins."""
         self._groups.forget()
         self._closed = ()
+        self._heed_nothing()
         self.take_over()
+
+    def _heed_nothing(self) -> None:
+        self._heeded: tuple[TemporaryClosure, ...] = ()
+        """These parts, with queues, as formations plan with them now."""
+        self._heeded_s = -math.inf
+        """Road time from which they do so."""
+        self._heed_again_s = math.inf
+        """Road time at which they heed what has changed since."""
 
     def take_over(self) -> None:
         """Discard all formations; joined formations stay joined."""
@@ -116,7 +129,7 @@ class FormationsOperation:
         """Update members, handle expired timers, request plans, send messages."""
         if self._planner.leading_since_s is None:
             self._planner.leading_since_s = t_s
-        if changed or self._groups.changed:
+        if changed or self._groups.changed or t_s >= self._heed_again_s:
             yield from self._update_members(census, t_s, now_s)
             self._groups.changed = False
         for leader in self.leaders.values():
@@ -133,7 +146,7 @@ class FormationsOperation:
 
     def _update_members(self, census: Census, t_s: float, now_s: float) -> Iterator[LogEntry]:
         scenario, groups = self._scenario, self._groups
-        of_road = stages(scenario, with_queues(self._closed, census, scenario))
+        of_road = self._stages(census, t_s)
         formations = closed_formations(census, t_s, scenario, groups, of_road)
         for numbers in joinable(formations, t_s, scenario):
             groups.join(numbers)
@@ -150,6 +163,18 @@ class FormationsOperation:
             else:
                 known = self._with_stage(formation, leader, of_road, t_s)
                 leader.on_members(known, now_s)
+
+    def _stages(self, census: Census, t_s: float) -> Sequence[Stage]:
+        """Return the stages of the road, with closed parts as they were up to `HEED_S` ago.
+
+        Every formation may plan again when they change, and slow vehicles of other systems and
+        queues change them several times in a second.
+        """
+        closed = with_queues(self._closed, census, self._scenario)
+        if closed != self._heeded and t_s >= self._heeded_s + HEED_S:
+            self._heeded, self._heeded_s = closed, t_s
+        self._heed_again_s = math.inf if closed == self._heeded else self._heeded_s + HEED_S
+        return stages(self._scenario, self._heeded)
 
     def _with_stage(
         self, formation: Formation, leader: FormationLeader, of_road: Sequence[Stage], t_s: float

@@ -9,7 +9,7 @@ import pytest
 
 from laneweave.coordinator.ballots.ballot_round import BallotPhase
 from laneweave.coordinator.formations.leader import LEADER_RULES
-from laneweave.coordinator.formations.operation import FormationsOperation
+from laneweave.coordinator.formations.operation import HEED_S, FormationsOperation
 from laneweave.coordinator.planning.solve import plan
 from laneweave.protocol.road_layout import ClearedPart, TemporaryClosure, TemporaryParts
 from laneweave.protocol.scenario.fields import Scenario
@@ -50,14 +50,20 @@ class Leading:
         )
         closed = ClosedFormation(BLOCKS[0], BLOCKS[-1], 0.0)
         self.census = Census(self.t_s, entries, (), (closed,), BLOCKS[-1])
-        self.phase_with(known)
+        self.phase_with(known, -HEED_S)
         (self.leader,) = self.operation.leaders.values()
         self.leader.phase = BallotPhase.IN_FORCE
 
-    def phase_with(self, known: TemporaryParts) -> BallotPhase:
+    def phase_with(self, known: TemporaryParts, after_s: float = 0.0) -> BallotPhase:
         """Return the phase of the leader after it has learned which parts are closed."""
         self.operation.on_obstacles(known)
-        list(self.operation.lead(self.census, self.t_s, NOW_S, changed=not self.operation.leaders))
+        return self.phase(after_s)
+
+    def phase(self, after_s: float) -> BallotPhase:
+        """Return the phase of the leader at a time after the formation was at its position."""
+        changed = not self.operation.leaders
+        t_s, now_s = self.t_s + after_s, NOW_S + after_s
+        list(self.operation.lead(self.census, t_s, now_s, changed=changed))
         (leader,) = self.operation.leaders.values()
         return leader.phase
 
@@ -97,6 +103,15 @@ def test_a_formation_plans_again_only_if_it_needs_another_plan(
     rear_m: float, before: TemporaryParts, after: TemporaryParts, phase: BallotPhase
 ) -> None:
     assert Leading(rear_m, before).phase_with(after) is phase
+
+
+def test_parts_that_change_again_soon_are_heeded_later() -> None:
+    leading = Leading(100.0, part(600.0, 620.0))
+    assert leading.phase_with(part(550.0, 620.0)) is PLANS_AGAIN
+    leading.leader.phase = BallotPhase.IN_FORCE
+    assert leading.phase_with(part(500.0, 620.0), 0.5 * HEED_S) is KEEPS_ITS_PLAN
+    assert leading.phase_with(NOTHING, 0.9 * HEED_S) is KEEPS_ITS_PLAN
+    assert leading.phase(HEED_S) is PLANS_AGAIN
 
 
 def test_a_formation_without_a_plan_in_force_learns_that_it_is_too_late() -> None:
