@@ -168,7 +168,7 @@ class StoppingTraffic(Lc2013Traffic):
 
     def _stop(self, one: ReferenceVehicle) -> None:
         self.stopped, api = one, self._sumo.vehicle
-        # SUMO rejects a stop nearer than the braking distance, which includes a step.
+        # SUMO rejects a stop nearer than the braking distance; a second of driving is spare.
         distance_m = one.speed_mps**2 / (2.0 * self._broken["decel_mps2"]) + one.speed_mps
         api.setStop(
             one.name,
@@ -233,7 +233,7 @@ def metrics(folder: Path, scenario: Scenario, point: Point) -> dict[str, Any]:
     obstacles = summary.obstacles or []
     end_s = _end_s(point, obstacles)
     vehicles = summary.vehicles
-    moving = np.isin(tracks.vehicle, [*_others(tracks, obstacles)])
+    others = np.isin(tracks.vehicle, [*_others(tracks, obstacles)])
     return {
         "demanded": vehicles.demanded,
         "left": vehicles.left,
@@ -241,12 +241,14 @@ def metrics(folder: Path, scenario: Scenario, point: Point) -> dict[str, Any]:
         "overlaps": summary.safety.overlaps,
         "min_gap_m": summary.safety.min_gap_m,
         "delay_s": _delay_s(trips),
-        "stopped": len(np.unique(tracks.vehicle[moving & (tracks.speed_mps < STOPPED_MPS)])),
-        "min_accel_mps2": round(float(tracks.accel_mps2[moving].min()), 2),
+        "stopped": len(np.unique(tracks.vehicle[others & (tracks.speed_mps < STOPPED_MPS)])),
+        "min_accel_mps2": round(float(tracks.accel_mps2[others].min()), 2),
         "emergency_brakes": summary.safety.emergency_brakes,
         "waited_s": round(sum(one.waited_s for one in obstacles), 1),
-        "lowest_speed_mps": [one.lowest_speed_mps for one in obstacles if one.lowest_speed_mps],
-        "closed_after_s": [round(one.since_s - _begins_s(point), 1) for one in obstacles[:1]],
+        "lowest_speed_mps": [
+            one.lowest_speed_mps for one in obstacles if one.lowest_speed_mps is not None
+        ],
+        "begins_after_s": [round(one.since_s - _begins_s(point), 1) for one in obstacles[:1]],
         "used_again_s": _used_again_s(tracks, scenario, obstacles),
         "free_again_s": None if end_s is None else _free_again_s(tracks, scenario, point, end_s),
     }
@@ -274,7 +276,11 @@ def _begins_s(point: Point) -> float:
 
 
 def _end_s(point: Point, obstacles: Sequence[ObstacleFigures]) -> float | None:
-    """Return the road time at which the cause of the last surprise was over, if there was one."""
+    """Return when the last surprise is over, if there was one.
+
+    For a breakdown this is its duration after the vehicle has begun to brake: the vehicle stands
+    for some seconds more.
+    """
     if point.breakdown is not None:
         return float(point.breakdown["at_s"] + point.breakdown["for_s"])
     return max((one.opened_s for one in obstacles if one.opened_s is not None), default=None)
@@ -289,20 +295,22 @@ def _used_again_s(
             there = np.floor(tracks.y_m / scenario.road.lane_width_m) == one.lane
             there &= np.abs(tracks.s_m - 0.5 * (one.from_m + one.to_m)) < 5.0
             there &= tracks.t_s >= one.opened_s
-            return round(float(tracks.t_s[there].min() - one.opened_s), 1)
+            used_s = tracks.t_s[there]
+            return round(float(used_s.min() - one.opened_s), 1) if len(used_s) else None
     return None
 
 
 def _free_again_s(tracks: Tracks, scenario: Scenario, point: Point, end_s: float) -> float | None:
     """Return the time after `end_s` from which traffic flows freely until the arrivals end.
 
-    None: it does not flow freely when they end.
+    Vehicles that wait at the entrance are not part of the traffic. None: it does not flow freely
+    when the arrivals end.
     """
     begins_s = np.arange(end_s, point.until_s - WINDOW_S + 1e-6, WINDOW_S)
     window = ((tracks.t_s - end_s) // WINDOW_S).astype(int)
     speeds = [float(tracks.speed_mps[window == number].mean()) for number in range(len(begins_s))]
     free = np.array(speeds) >= FREE_SHARE * scenario.formation.speed_mps
-    if not free[-1]:
+    if not free.any() or not free[-1]:
         return None
     return float(WINDOW_S * (len(free) - np.argmin(free[::-1]))) if not free.all() else 0.0
 

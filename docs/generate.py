@@ -795,7 +795,7 @@ def _stability() -> str:
 def _surprises() -> str:
     """Return the table of runs with surprises, by `benchmarks/surprises.py`."""
     headings = (
-        "surprise", "veh/(lane h)", "method", "runs", "mean delay", "range", "stopped",
+        "surprise", "veh/(lane h)", "method", "runs", "mean delay", "range", "stopped in a run",
         "in another lane", "overlaps", "acceleration", "flows freely again after",
     )  # fmt: skip
     lines = [f"| {' | '.join(headings)} |", "|---" * len(headings) + "|"]
@@ -807,16 +807,18 @@ def _surprises() -> str:
         delays_s = [run["delay_s"] for run in runs]
         free_s = [run["free_again_s"] for run in runs]
         free = "no" if None in free_s else f"{max(free_s):.0f} s"
+        if point.surprise == "none" or point.label in surprises.REFERENCES:
+            free = ""
         lossy = f", {100 * point.loss:g} % loss" if point.loss else ""
         others = sum(run["in_another_lane"] for run in runs)
         lines.append(
             f"| {point.surprise}{lossy} | {point.volume} | {point.label} | {len(runs)} "
             f"| {fmean(delays_s):z.1f} s | {min(delays_s):z.1f} to {max(delays_s):z.1f} s "
-            f"| {sum(run['stopped'] for run in runs)} "
+            f"| {fmean(run['stopped'] for run in runs):.1f} "
             f"| {others} of {sum(run['left'] for run in runs):,} "
             f"| {sum(run['overlaps'] for run in runs)} "
             f"| {min(run['min_accel_mps2'] for run in runs):.1f} m/s2 "
-            f"| {free if point.surprise != 'none' else ''} |"
+            f"| {free} |"
         )
     return "\n".join(lines)
 

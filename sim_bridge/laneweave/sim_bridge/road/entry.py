@@ -191,10 +191,13 @@ class EntryMeter:
 
     def vehicles_in_column(self, t_s: float) -> float:
         """Return the mean number of vehicles of a column that entered at the start of the road."""
+        self._forget_entered(t_s)
         entered_s, column_s = self._entered_s, self._lattice.pitch_m / self._lattice.speed_mps
-        while entered_s and entered_s[0] < t_s - LOAD_S:
-            entered_s.popleft()
         return len(entered_s) * column_s / max(column_s, min(t_s, LOAD_S))
+
+    def _forget_entered(self, t_s: float) -> None:
+        while self._entered_s and self._entered_s[0] < t_s - LOAD_S:
+            self._entered_s.popleft()
 
     def points_kept_free(self, point: int) -> Collection[int]:
         """Return the entry points at which `keep_free` keeps columns free: with formations, all."""
@@ -274,6 +277,7 @@ class EntryMeter:
                 self._free_s[point] = t_s + self._lattice.pitch_m / self._lattice.speed_mps
             self._columns[point] -= 1
         self._until_s = until_s + TIME_TOLERANCE_S
+        self._forget_entered(until_s)
         # Columns that have passed are not available to later arrivals.
         for point in self._points:
             self._skip(point, until_s - TIME_TOLERANCE_S)

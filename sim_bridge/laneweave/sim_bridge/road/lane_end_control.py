@@ -49,11 +49,12 @@ from laneweave.sim_bridge.road.vehicle import RoadVehicle
 OPEN_GAPS, CROWDED_GAPS = 1, 5
 """Number of gap lengths of columns between two gaps of a lane that vehicles may enter, so that its
 traffic, and vehicles that change into it, keep most of its cells; and the same while vehicles wait
-at the entrance of the lane, or, while a part is closed for a time, of any. With fewer, gaps would
-use up the capacity of dense traffic."""
+at the entrance of the lane or, while a part is closed for a time, at any entrance. With fewer, gaps
+would use up the capacity of dense traffic."""
 USED_SHARE = 0.8
-"""Share of the cells past closed parts that vehicles and gaps use together. With more, vehicles
-find no way out of the closed lane, stop, and need gaps in turn."""
+"""Share of the cells past closed parts that gaps and vehicles from the start of the road use
+together, as far as `CROWDED_GAPS` allows. With more, vehicles find no way out of the closed lane,
+stop, and need gaps in turn."""
 
 
 @define
@@ -93,6 +94,7 @@ class LaneEndControl:
         self._queue_m = queue_pitch_m(scenario)
         self._any = False
         self._cleared: tuple[ClearedPart, ...] = ()
+        self._closed: Sequence[TemporaryClosure] = ()
         self._ends: dict[LanePosition, LaneEnd] = {}
         """Dead ends by lane and end; those that have vanished as long as vehicles wait there."""
         self._sections: tuple[LaneSection, ...] = ()
@@ -117,6 +119,7 @@ class LaneEndControl:
             closed: these parts. One may vanish only when no vehicle waits there (`in_use`).
         """
         scenario, self._cleared = self._scenario, lane_ends.temporary.cleared
+        self._closed = closed
         self._ends = {(end.lane, end.end_m): end for end in lane_ends}
         self._any = bool(lane_ends)
         if self._ends:
@@ -202,11 +205,11 @@ class LaneEndControl:
                 ahead_m = vehicle.state[0]
 
     def bodies(self, vehicles: Mapping[Name, RoadVehicle], t_s: float) -> dict[Name, OffLattice]:
-        """Return the lane and the rear of each vehicle without cells, as far as plans avoid them.
+        """Return the lane and the rear of each vehicle without cells, where plans must expect it.
 
         A vehicle that still drives up to its line counts as where it will stand. One that re-enters
-        counts as at the end of the road once it is in its new lane, unless it falls behind its gap:
-        nobody is led into the gap, and those behind it will never be nearer to the vehicle.
+        counts as at the end of the road once it is in the lane of its gap, unless it falls behind:
+        no plan leads into the gap, and those behind it will never be nearer to the vehicle.
         """
         found: dict[Name, OffLattice] = {}
         for at, end in self._ends.items():
@@ -222,8 +225,8 @@ class LaneEndControl:
                 rear_m, lane = vehicle.state[0] - vehicle.size[0], vehicle.body_lane
                 if vehicle.controller.off_lattice is OffLatticePhase.RE_ENTERING:
                     column, its_lane = vehicle.controller.hold_cell
-                    least_m = self._lattice.cell_s_m(column, t_s) - ARRIVED_ALONG_M
-                    in_gap = lane == its_lane and vehicle.state[0] >= least_m
+                    min_m = self._lattice.cell_s_m(column, t_s) - ARRIVED_ALONG_M
+                    in_gap = lane == its_lane and vehicle.state[0] >= min_m
                     rear_m = self._scenario.road.length_m if in_gap else rear_m
                 found[name] = OffLattice(lane, rear_m)
         return found
@@ -257,14 +260,16 @@ class LaneEndControl:
             # Others enter the lane only behind it. The vehicle ahead must have started before the
             # gap arrives. The gap before needs the longer to that vehicle the farther ahead it is.
             between = math.ceil(max(ahead_m - vehicle.state[0], 0.0) / self._lattice.pitch_m)
+        # Its own lane is closed beside the others only if no other part is closed elsewhere.
+        passes_parts = not own or any(part.lane != lane for part in self._closed)
         last = self._last_gap_column.get(point, math.inf)
         if self._meter.next_column(point) < last - between:
-            columns = self._meter.keep_free(point, self._columns, t_s, passes_parts=not own)
+            columns = self._meter.keep_free(point, self._columns, t_s, passes_parts=passes_parts)
             self._last_gap_column |= dict.fromkeys(taken, columns[0])
             gaps.append(Gap(lane, columns))
 
-    def _columns_between_gaps(self, points: Collection[int], t_s: float) -> float:
-        """Return the number of columns between two gaps of a lane.
+    def _columns_between_gaps(self, points: Collection[int], t_s: float) -> int:
+        """Return the minimum number of columns between two gaps of a lane.
 
         See `CROWDED_GAPS` and `USED_SHARE`.
 
@@ -272,15 +277,18 @@ class LaneEndControl:
             points: entry points whose vehicles cannot enter the columns of a gap.
             t_s: road time.
         """
-        least, most = OPEN_GAPS * self._columns, CROWDED_GAPS * self._columns
-        lanes = self._meter.most_in_column
-        if any(lanes is not None or one.entry_point in points for one in self._meter.waiting):
-            return most
-        if lanes is None:
-            return least
-        spare = USED_SHARE * lanes - self._meter.vehicles_in_column(t_s)
-        needed = self._columns / spare - self._columns if spare > 0.0 else math.inf
-        return min(max(needed, least), most)
+        columns, open_lanes = self._columns, self._meter.most_in_column
+        min_columns, max_columns = OPEN_GAPS * columns, CROWDED_GAPS * columns
+        waiting = self._meter.waiting
+        if any(open_lanes is not None or one.entry_point in points for one in waiting):
+            return max_columns
+        if open_lanes is None:
+            return min_columns
+        spare_cells = USED_SHARE * open_lanes - self._meter.vehicles_in_column(t_s)
+        gap_cells = columns * min(len(points), open_lanes)
+        if gap_cells >= spare_cells * (columns + max_columns):
+            return max_columns
+        return max(min_columns, math.ceil(gap_cells / spare_cells) - columns)
 
     def _is_open(self, at: LanePosition, vehicle: RoadVehicle) -> bool:
         """Return whether a vehicle can drive on in its lane, beyond a dead end.
@@ -336,8 +344,8 @@ class LaneEndControl:
         return vehicle.state[0] <= self._ends[at].line_m + NEAR_LINE_M
 
     def _may_start(self, at: LanePosition, vehicle: RoadVehicle) -> bool:
-        """Return whether a vehicle has room to start from where it waits."""
-        return (
+        """Return whether a vehicle drives, and has room to start from where it waits."""
+        return vehicle.controller.broken_mps2 is None and (
             self._is_before_line(at, vehicle)
             or self._starts_in_own_lane(at, vehicle)
             or self._beside(at, vehicle) is not None
@@ -368,11 +376,7 @@ class LaneEndControl:
         self, at: LanePosition, vehicles: Mapping[Name, RoadVehicle]
     ) -> list[RoadVehicle]:
         """Return the vehicles that may start from where they wait, foremost first."""
-        return [
-            one
-            for one in self._waiting(at, vehicles)
-            if one.controller.broken_mps2 is None and self._may_start(at, one)
-        ]
+        return [one for one in self._waiting(at, vehicles) if self._may_start(at, one)]
 
     def _blocking(
         self, vehicle: RoadVehicle, at: LanePosition, vehicles: Mapping[Name, RoadVehicle]

@@ -20,9 +20,10 @@ from laneweave.protocol.wire.events import (
     PART_CLOSED,
     PART_OPENED,
 )
-from laneweave.protocol.wire.messages import Name
+from laneweave.protocol.wire.messages import Name, OffLattice
 from laneweave.protocol.wire.obstacle_messages import BREAKDOWN, CLOSED, Obstacle
 from laneweave.sim_bridge.bodies.stop_lines import STANDING_MPS
+from laneweave.sim_bridge.road.entry import EntryMeter
 from laneweave.sim_bridge.road.lane_end_control import CROWDED_GAPS, OPEN_GAPS
 from laneweave.sim_bridge.road.obstacles import ActiveObstacle, Breakdown
 from support import road_bugs
@@ -140,6 +141,46 @@ def test_gaps_leave_cells_for_the_vehicles_that_pass(volume: float, least: int, 
     ahead, behind = sorted(seen, key=lambda kept: -kept.start)
     columns = re_entry(ROAD).columns
     assert least * columns <= ahead.start - behind.stop <= most * columns
+
+
+@pytest.mark.parametrize(
+    "elsewhere", [False, True], ids=["one part", "a part of another lane, too"]
+)
+def test_own_gaps_count_where_others_pass_another_part(
+    monkeypatch: pytest.MonkeyPatch, *, elsewhere: bool
+) -> None:
+    """A gap in a lane that is repaired takes no cell from those that pass, unless they use it."""
+    found: list[tuple[int, bool]] = []
+    keep_free = EntryMeter.keep_free
+
+    def noted(
+        self: EntryMeter, point: int, count: int, t_s: float, *, passes_parts: bool = True
+    ) -> range:
+        found.append((point, passes_parts))
+        return keep_free(self, point, count, t_s, passes_parts=passes_parts)
+
+    monkeypatch.setattr(EntryMeter, "keep_free", noted)
+    event = RoadEvent(0, 750.0, 800.0, AT_S, until_s=END_S, clear_s=0.0)
+    road = lonely_road(BREAKS_DOWN, volume=1000.0, events=(event,) if elsewhere else ())
+    while road.t_s < AT_S + STANDS_S + 15.0:
+        road.step()
+    assert {counts for lane, counts in found if lane == LANE} == {elsewhere}
+
+
+def test_the_census_tells_where_those_stand_that_have_stopped() -> None:
+    road = lonely_road(BREAKS_DOWN, volume=1500.0)
+    while road.t_s < AT_S + STANDS_S:
+        road.step()
+    census = road.roadside.publisher.census(road.t_s, road.vehicles.values())
+    bodies = {one.vehicle: one.off_lattice for one in census.on_road}
+    standing = [
+        one
+        for one in road.vehicles.values()
+        if one.controller.stays and one.state[1] <= STANDING_MPS
+    ]
+    assert len(standing) >= 3
+    for one in standing:
+        assert bodies[one.name] == OffLattice(LANE, one.state[0] - one.size[0])
 
 
 def test_the_vehicle_slows_down_as_given_stands_as_long_as_given_and_is_where_it_was_said() -> None:

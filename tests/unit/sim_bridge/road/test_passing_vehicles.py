@@ -17,6 +17,7 @@ from laneweave.sim_bridge.recording.obstacle_log import ObstacleLog
 from laneweave.sim_bridge.road.passing_vehicles import (
     CLEARED_BEHIND_M,
     PassingVehicle,
+    PassingVehicles,
     gap_needed_m,
 )
 from support import road_bugs
@@ -191,6 +192,18 @@ def test_the_gap_from_which_a_vehicle_does_not_brake() -> None:
         vehicle = passing(FAST, 25.0)
         vehicle.step(gap_m, 15.0, TICK_S)
         assert (vehicle.speed_mps < 25.0) is brakes
+
+
+@pytest.mark.parametrize(("slots", "enters"), [(2.9, False), (3.1, True)])
+def test_a_fast_vehicle_enters_with_room_for_three_slots(slots: float, enters: bool) -> None:
+    lattice_mps, slot_s = ROAD.lattice.speed_mps, ROAD.timing.cycles_s[0]
+    gap_m = gap_needed_m(FAST.speed_mps, lattice_mps)
+    gap_m += slots * slot_s * (FAST.speed_mps - lattice_mps)
+    ahead = passing(FAST, lattice_mps)
+    ahead.s_m = FAST.to_m + gap_m + ahead.length_m
+    vehicles = PassingVehicles(ROAD, [FAST])
+    vehicles.update({Name("v0001"): ahead}, (), FAST.at_s)
+    assert bool(vehicles.on_road) == enters
 
 
 def test_motion_controllers_begin_no_lane_change_in_front_of_a_fast_vehicle() -> None:
