@@ -220,6 +220,11 @@ class MotionController:
         """
         return self.off_lattice is None and self._misses_exit(self.hold_cell, t_s)
 
+    def has_missed_lane(self, t_s: float) -> bool:
+        """Return whether the lane of the hold cell has been closed before the body was in it."""
+        outside = self.off_lattice is None and self._body_lane != self.hold_cell[1]
+        return outside and self.stop_lines.lane_ends.has_passed(self.hold_cell, t_s)
+
     def _misses_exit(self, goal: Cell, t_s: float) -> bool:
         """Return whether it is too late to begin to leave the lane of the body for a cell."""
         ends, lane = self.stop_lines.lane_ends, self._body_lane_for(goal[1])
@@ -232,18 +237,16 @@ class MotionController:
         formation, no other vehicle is led into the cell before the move is complete. Commands for
         earlier ticks, which may repeat the move, are no longer accepted.
         """
-        if not self.store.territory.may_hold(self.record, self.motion.origin):
+        origin = self.motion.origin
+        if origin[1] != self._body_lane or not self.store.territory.may_hold(self.record, origin):
             return False
-        if self.motion.origin[1] != self._body_lane:
-            return False
-        self._guard.moving_from, self.hold_cell = self.hold_cell, self.motion.origin
+        self._guard.moving_from, self.hold_cell = self.hold_cell, origin
         self.command_tick = max(self.command_tick, round(t_s / self.tick_s) - 1)
         self._stop_motion()
         return True
 
     @property
     def _body_lane(self) -> int:
-        """Lane of the hold cell if the body touches it; otherwise the lane of the body's centre."""
         return self._body_lane_for(self.hold_cell[1])
 
     def _body_lane_for(self, goal: int) -> int:
@@ -374,8 +377,7 @@ class MotionController:
 
     def displaced(self, tick: int) -> bool:
         """Return whether the body is too far from its cell to hold it at `tick`."""
-        t_s = tick * self.tick_s
-        room_ahead_m = self._scenario.types.room_ahead_m
+        t_s, room_ahead_m = tick * self.tick_s, self._scenario.types.room_ahead_m
         return displaced(self.measured, self.lattice, self.hold_cell, t_s, room_ahead_m)
 
     def step(self, tick: int) -> None:
@@ -468,9 +470,7 @@ class MotionController:
         s_m, speed_mps = self.measured[:2]
         columns = self.motion.origin[0], self.hold_cell[0]
         t_s = tick * self.tick_s
-        if self.stop_lines.lane_ends.has_passed(self.hold_cell, t_s):
-            return True  # the other lane has ended meanwhile
-        if self.has_missed_exit(t_s):
+        if self.has_missed_lane(t_s) or self.has_missed_exit(t_s):
             return True
         rear_m = self.lattice.cell_s_m(min(columns), t_s) - DISPLACED_ALONG_M
         front_m = self.lattice.cell_s_m(max(columns), t_s)

@@ -171,17 +171,7 @@ class LaneEndControl:
         for name in [name for name in self._end_of if name not in vehicles]:
             self._forget(name)
         for name, vehicle in vehicles.items():
-            controller = vehicle.controller
-            missed = controller.has_missed_exit(t_s)
-            if missed and controller.return_to_origin(t_s):
-                yield LaneEndChange(name, MISSED_EXIT, controller.hold_cell[1])
-            elif (missed and self._cells_stay_free) or controller.has_lost_cell(t_s):
-                # While it re-enters, a vehicle may come to another dead end.
-                yield self.take_off(name, vehicle)
-            elif controller.off_lattice is OffLatticePhase.WAITING:
-                # Parts that are closed for a time come and go ahead of it.
-                lane, s_m = controller.hold_cell[1], vehicle.state[0]
-                self._end_of[name] = self._end_ahead(lane, s_m)
+            yield from self._leave(name, vehicle, t_s)
         for at, gaps in self._gaps.items():
             startable = self._startable(at, vehicles)
             if startable and not self._blocking(startable[0], at, vehicles):
@@ -203,6 +193,22 @@ class LaneEndControl:
                     break
                 free.remove(own)
                 ahead_m = vehicle.state[0]
+
+    def _leave(self, name: Name, vehicle: RoadVehicle, t_s: float) -> Iterator[LaneEndChange]:
+        """Take a vehicle off the lattice, or back into its own lane, where a lane has ended."""
+        controller = vehicle.controller
+        missed = controller.has_missed_exit(t_s)
+        if missed and controller.return_to_origin(t_s):
+            yield LaneEndChange(name, MISSED_EXIT, controller.hold_cell[1])
+        elif (missed and self._cells_stay_free) or controller.has_lost_cell(t_s):
+            # While it re-enters, a vehicle may come to another dead end.
+            yield self.take_off(name, vehicle)
+        elif controller.has_missed_lane(t_s):
+            # Otherwise it would stop beside the part, for what stands in it.
+            controller.return_to_origin(t_s)
+        elif controller.off_lattice is OffLatticePhase.WAITING:
+            # Parts that are closed for a time come and go ahead of it.
+            self._end_of[name] = self._end_ahead(controller.hold_cell[1], vehicle.state[0])
 
     def bodies(self, vehicles: Mapping[Name, RoadVehicle], t_s: float) -> dict[Name, OffLattice]:
         """Return the lane and the rear of each vehicle without cells, where plans must expect it.
