@@ -220,11 +220,6 @@ class MotionController:
         """
         return self.off_lattice is None and self._misses_exit(self.hold_cell, t_s)
 
-    def has_missed_lane(self, t_s: float) -> bool:
-        """Return whether the lane of the hold cell has been closed before the body was in it."""
-        outside = self.off_lattice is None and self._body_lane != self.hold_cell[1]
-        return outside and self.stop_lines.lane_ends.has_passed(self.hold_cell, t_s)
-
     def _misses_exit(self, goal: Cell, t_s: float) -> bool:
         """Return whether it is too late to begin to leave the lane of the body for a cell."""
         ends, lane = self.stop_lines.lane_ends, self._body_lane_for(goal[1])
@@ -247,6 +242,7 @@ class MotionController:
 
     @property
     def _body_lane(self) -> int:
+        """Lane of the hold cell if the body touches it; otherwise the lane of the body's centre."""
         return self._body_lane_for(self.hold_cell[1])
 
     def _body_lane_for(self, goal: int) -> int:
@@ -470,7 +466,9 @@ class MotionController:
         s_m, speed_mps = self.measured[:2]
         columns = self.motion.origin[0], self.hold_cell[0]
         t_s = tick * self.tick_s
-        if self.has_missed_lane(t_s) or self.has_missed_exit(t_s):
+        if self.stop_lines.lane_ends.has_passed(self.hold_cell, t_s):
+            return True  # the other lane has ended meanwhile
+        if self.has_missed_exit(t_s):
             return True
         rear_m = self.lattice.cell_s_m(min(columns), t_s) - DISPLACED_ALONG_M
         front_m = self.lattice.cell_s_m(max(columns), t_s)

@@ -203,10 +203,6 @@ class LaneEndControl:
         elif (missed and self._cells_stay_free) or controller.has_lost_cell(t_s):
             # While it re-enters, a vehicle may come to another dead end.
             yield self.take_off(name, vehicle)
-        elif self._cells_stay_free and controller.has_missed_lane(t_s):
-            # Otherwise it would stop beside the part, for what stands in it. In a formation, whose
-            # plan goes on, this made others stop.
-            controller.return_to_origin(t_s)
         elif controller.off_lattice is OffLatticePhase.WAITING:
             # Parts that are closed for a time come and go ahead of it.
             self._end_of[name] = self._end_ahead(controller.hold_cell[1], vehicle.state[0])

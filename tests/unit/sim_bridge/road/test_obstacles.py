@@ -20,13 +20,12 @@ from laneweave.protocol.wire.events import (
     PART_CLOSED,
     PART_OPENED,
 )
-from laneweave.protocol.wire.messages import CurrentMotion, Name, OffLattice
+from laneweave.protocol.wire.messages import Name, OffLattice
 from laneweave.protocol.wire.obstacle_messages import BREAKDOWN, CLOSED, Obstacle
 from laneweave.sim_bridge.bodies.stop_lines import STANDING_MPS
 from laneweave.sim_bridge.road.entry import EntryMeter
 from laneweave.sim_bridge.road.lane_end_control import CROWDED_GAPS, OPEN_GAPS
 from laneweave.sim_bridge.road.obstacles import ActiveObstacle, Breakdown
-from laneweave.sim_bridge.road.vehicle import RoadVehicle
 from support import road_bugs
 from support.bugs import Bug, catches
 from support.closed_lanes import LonelyRoad, road_with
@@ -77,10 +76,6 @@ def check_obstacle(one: ActiveObstacle, road: LonelyRoad) -> None:
     elif broken is not None and one.breakdown is not None and not one.is_over(road.t_s):
         stops_s = broken.controller.lattice.speed_mps / one.breakdown.decel_mps2 + 2.0
         assert road.t_s < one.since_s + stops_s or broken.state[1] < STANDING_MPS
-
-
-def position(vehicle: RoadVehicle) -> float:
-    return vehicle.state[0]
 
 
 def names(road: LonelyRoad, kind: str) -> list[Name]:
@@ -170,26 +165,6 @@ def test_own_gaps_count_where_others_pass_another_part(
     while road.t_s < AT_S + STANDS_S + 15.0:
         road.step()
     assert {counts for lane, counts in found if lane == LANE} == {elsewhere}
-
-
-def test_a_vehicle_whose_move_leads_into_a_closed_part_drives_past_it_in_its_own_lane() -> None:
-    road = lonely_road(BREAKS_DOWN, volume=1000.0)
-    while not road.roadside.obstacles.active:
-        road.step()
-    (part,) = (one.part for one in road.roadside.obstacles.active)
-    beside = [one for one in road.vehicles.values() if one.cell[1] == LANE - 1]
-    vehicle = max((one for one in beside if one.state[0] < part.from_m - 30.0), key=position)
-    controller, (column, lane) = vehicle.controller, vehicle.controller.hold_cell
-    # As if the move had begun in the tick before.
-    controller.store.assign_cell((column, LANE))
-    controller.hold_cell = (column, LANE)
-    controller.motion = CurrentMotion((column, lane))
-    lowest_mps = math.inf
-    while vehicle.state[0] < part.from_m + 100.0:
-        road.step()
-        lowest_mps = min(lowest_mps, vehicle.state[1])
-    assert controller.hold_cell == (column, lane)
-    assert lowest_mps > 0.5 * road.scenario.lattice.speed_mps
 
 
 def test_the_census_tells_where_those_stand_that_have_stopped() -> None:
