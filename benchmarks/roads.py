@@ -9,17 +9,11 @@ finished runs are not repeated unless `--again` is given.
 
 from __future__ import annotations
 
-import argparse
-import contextlib
-import json
-import multiprocessing
-import os
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any, Final
 
@@ -28,6 +22,7 @@ import numpy as np
 from attrs import field, frozen
 
 from evaluation.lattice_points import lattice_spacing
+from experiments import Job, run_points, silence
 from laneweave.launch.faults.fault_file import FaultSpec, load_faults
 from laneweave.launch.recordings.trajectories import Tracks, read_tracks, read_trips
 from laneweave.launch.run.reference_run import ReferenceRun
@@ -36,7 +31,6 @@ from laneweave.launch.run_methods import FORMATION, METHODS
 from laneweave.protocol.config.participants import coordinator_names
 from laneweave.protocol.config.scenario_files import load_scenario
 from laneweave.protocol.config.source_files import read_toml_source
-from laneweave.protocol.files import write_atomically
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.road_tables import MAIN_ENTRANCE
 from laneweave.protocol.summary import read_summary
@@ -190,23 +184,10 @@ POINTS: Final = (
 )
 
 
-@frozen
-class Job:
-    """One run of a point."""
-
-    point: Point
-    seed: int
-
-    @property
-    def key(self) -> str:
-        """Name of the run in the record."""
-        return f"{self.point.name} seed {self.seed}"
-
-
-def drive(job: Job) -> dict[str, Any]:
+def drive(job: Job[Point]) -> dict[str, Any]:
     """Drive one run, and return its results."""
     scenario, method = job.point.settings(job.seed), METHODS[job.point.label].method
-    with tempfile.TemporaryDirectory(prefix="laneweave-roads-") as name, _silence():
+    with tempfile.TemporaryDirectory(prefix="laneweave-roads-") as name, silence():
         folder, began_s = Path(name), time.process_time()
         if job.point.processes:
             problems: Sequence[str] = _run_processes(job, folder)
@@ -226,7 +207,7 @@ def drive(job: Job) -> dict[str, Any]:
         }
 
 
-def _run_processes(job: Job, folder: Path) -> list[str]:
+def _run_processes(job: Job[Point], folder: Path) -> list[str]:
     """Run a scenario file with real processes; return the errors of the command."""
     command = [str(Path(sys.executable).parent / "laneweave"), "run", "--no-progress"]
     command += [str(SCENARIOS / f"{job.point.scenario}.toml"), "--vehicles-per-process", "1"]
@@ -327,67 +308,17 @@ def _faults(name: str | None, scenario: Scenario) -> FaultSpec:
     return load_faults(choice, coordinator_names(scenario))
 
 
-@contextlib.contextmanager
-def _silence() -> Iterator[None]:
-    """Discard the log of a run."""
-    with Path(os.devnull).open("w", encoding="utf-8") as sink, contextlib.redirect_stdout(sink):
-        yield
-
-
-def jobs_of(only: Sequence[str], seeds: int | None) -> list[Job]:
-    """Return the runs of the points whose names contain one of the texts, seed by seed."""
-    chosen = [one for one in POINTS if not only or any(text in one.name for text in only)]
-    counts = {one: one.seeds if seeds is None else min(seeds, one.seeds) for one in chosen}
-    last = max(counts.values(), default=0)
-    return [Job(one, n) for n in range(1, last + 1) for one in chosen if n <= counts[one]]
-
-
 def main() -> int:
     """Run the missing points and record their results."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--only", nargs="+", default=(), help="points whose names contain a text")
-    parser.add_argument("--again", action="store_true", help="repeat finished runs")
-    parser.add_argument("--seeds", type=int, help="number of seeds; default: that of the point")
-    parser.add_argument("--jobs", type=int, default=os.cpu_count(), help="parallel runs")
-    parser.add_argument("--out", type=Path, default=OUT, help="folder of roads.json")
-    options = parser.parse_args()
-    options.out.mkdir(parents=True, exist_ok=True)
-    record, failed = options.out / RECORD, False
-    known = json.loads(record.read_text(encoding="utf-8")) if record.exists() else {}
-    jobs = jobs_of(options.only, options.seeds)
-    jobs = [job for job in jobs if options.again or job.key not in known]
-    # Real processes use both cores, so that these runs follow each other.
-    for part, workers in ((False, options.jobs), (True, 1)):
-        # libsumo runs one simulation per process.
-        with ProcessPoolExecutor(
-            workers, multiprocessing.get_context("spawn"), max_tasks_per_child=1
-        ) as pool:
-            chosen = [job for job in jobs if job.point.processes == part]
-            waiting = {pool.submit(drive, job): job for job in chosen}
-            for done in as_completed(waiting):
-                job = waiting[done]
-                if (error := done.exception()) is not None:
-                    sys.stderr.write(f"{job.key}: {error}\n")
-                    failed = True
-                    continue
-                known[job.key] = done.result()
-                _record(record, known)
-                line = shown(known[job.key])
-                sys.stderr.write(f"{time.strftime('%H:%M:%S')} {job.key} {line}\n")
-    return int(failed)
-
-
-def _record(record: Path, known: Mapping[str, Any]) -> None:
-    """Write all results, in the order of the points."""
-    order = [one.key for one in jobs_of((), None)]
-    rows = {key: known[key] for key in [*order, *known] if key in known}
-    write_atomically(record, json.dumps(rows, indent=1) + "\n")
-
-
-def shown(row: Mapping[str, Any]) -> str:
-    """Return the results of a run in a line."""
-    hidden = ("point", "seed", "ending", "delay_by_destination_s", "throughput_veh_per_lane_h")
-    return " ".join(f"{key}={value}" for key, value in row.items() if key not in hidden)
+    hidden = ("ending", "delay_by_destination_s", "throughput_veh_per_lane_h")
+    return run_points(
+        POINTS,
+        drive,
+        OUT / RECORD,
+        __doc__,
+        hidden=hidden,
+        alone=lambda point: point.processes,
+    )
 
 
 if __name__ == "__main__":

@@ -3,37 +3,33 @@
     python benchmarks/surprises.py [--only TEXT ...] [--seeds N] [--again]
 
 Each run drives the paper's road with 330 s of arrivals over the simulated network, where results
-repeat exactly. In the runs with SUMO's drivers, SUMO stops a vehicle at the same place. The results
+repeat exactly. In the runs with SUMO's drivers, SUMO stops a vehicle in the same lane. The results
 are in docs/evidence/surprises.json; finished runs are not repeated unless `--again` is given.
 """
 
 from __future__ import annotations
 
-import argparse
-import contextlib
-import json
-import multiprocessing
-import os
 import sys
 import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 from attrs import field, frozen
 
+from experiments import Job, run_points, silence
 from laneweave.launch.faults.fault_file import load_faults
-from laneweave.launch.recordings.trajectories import Tracks, read_tracks, read_trips
+from laneweave.launch.recordings.trajectories import Tracks, read_tracks
 from laneweave.launch.run.simulated_run import SimulatedRun
 from laneweave.launch.run_methods import FORMATION, METHODS
 from laneweave.protocol.config.participants import coordinator_names
 from laneweave.protocol.config.scenario_files import load_scenario
-from laneweave.protocol.files import write_atomically
 from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.road_tables import MAIN_ENTRANCE
 from laneweave.protocol.summary import Ending, ObstacleFigures, read_summary
+from laneweave.protocol.wire.obstacle_messages import BREAKDOWN, CLOSED
 from laneweave.sim_bridge.baselines.lc2013 import Lc2013Traffic
 from laneweave.sim_bridge.baselines.reference_road import (
     Entrance,
@@ -44,13 +40,14 @@ from laneweave.sim_bridge.recording.run_record import RunRecord
 from laneweave.sim_bridge.road_sources import demand_of
 from laneweave.sim_bridge.sumo.traffic import SumoTraffic
 
-OUT: Final = Path(__file__).resolve().parents[1] / "docs" / "evidence" / "surprises.json"
+OUT: Final = Path(__file__).resolve().parents[1] / "docs" / "evidence"
+RECORD: Final = "surprises.json"
 DURATION_S: Final = 330.0
 LANE: Final = 1
 """The middle lane, in which all surprises happen."""
 BROKEN: Final = {"at_s": 100.0, "lane": LANE, "at_m": 600.0, "decel_mps2": 3.0, "for_s": 120.0}
 """The first vehicle beyond 600 m stands for two minutes."""
-CLOSED: Final = {"lane": LANE, "from_m": 600.0, "to_m": 700.0, "at_s": 100.0, "for_s": 60.0}
+CLOSING: Final = {"lane": LANE, "from_m": 600.0, "to_m": 700.0, "at_s": 100.0, "for_s": 60.0}
 PASSING: Final = {"lane": LANE, "at_s": 80.0}
 BODY_M: Final = 7.0
 """Length of a passing vehicle."""
@@ -114,7 +111,7 @@ def _points() -> Iterator[Point]:
             yield Point("breakdown", label, volume, breakdown=BROKEN)
     for label in OPERATIONS:
         for ahead_m, clear_s in ((300, 20.0), (50, 10.0 / 3.0)):
-            event = {**CLOSED, "clear_s": clear_s}
+            event = {**CLOSING, "clear_s": clear_s}
             yield Point(f"closed {ahead_m} m ahead", label, 1450, event=event)
         for speed_mps in (5.0, 10.0):
             event = {**PASSING, **_body(500.0), "speed_mps": speed_mps}
@@ -131,21 +128,8 @@ def _body(from_m: float) -> dict[str, float]:
 POINTS: Final = tuple(_points())
 
 
-@frozen
-class Job:
-    """One run of a point."""
-
-    point: Point
-    seed: int
-
-    @property
-    def key(self) -> str:
-        """Name of the run in the record."""
-        return f"{self.point.name} seed {self.seed}"
-
-
 class StoppingTraffic(Lc2013Traffic):
-    """SUMO's traffic, in which the first vehicle beyond a place stops for a time."""
+    """SUMO's traffic, in which the first vehicle beyond a position stops for a time."""
 
     def __init__(self, scenario: Scenario, sumo: SumoTraffic, broken: Mapping[str, Any]) -> None:
         """Begin with an empty road; `broken` is a table `[[breakdown]]`."""
@@ -179,10 +163,10 @@ class StoppingTraffic(Lc2013Traffic):
         )
 
 
-def drive(job: Job) -> dict[str, Any]:
+def drive(job: Job[Point]) -> dict[str, Any]:
     """Drive one run, and return its results."""
     point, scenario = job.point, job.point.settings(job.seed)
-    with tempfile.TemporaryDirectory(prefix="laneweave-surprises-") as name, _silence():
+    with tempfile.TemporaryDirectory(prefix="laneweave-surprises-") as name, silence():
         folder, began_s = Path(name), time.process_time()
         problems: Sequence[str] = ()
         if METHODS[point.label].method == FORMATION:
@@ -211,7 +195,7 @@ def _faults(point: Point) -> dict[str, Any]:
 def _let_sumo_drive(
     scenario: Scenario, folder: Path, method: str, broken: Mapping[str, Any] | None
 ) -> None:
-    """Record a run in which SUMO drives all vehicles, and perhaps stops one."""
+    """Record a run in which SUMO drives all vehicles, and stops one if there is a breakdown."""
     with tempfile.TemporaryDirectory() as files, SumoTraffic(scenario, Path(files)) as sumo:
         traffic = (
             StoppingTraffic(scenario, sumo, broken) if broken else Lc2013Traffic(scenario, sumo)
@@ -227,20 +211,22 @@ def _let_sumo_drive(
 
 def metrics(folder: Path, scenario: Scenario, point: Point) -> dict[str, Any]:
     """Return the results of a finished run."""
-    summary, trips, tracks = read_summary(folder), read_trips(folder), read_tracks(folder)
+    summary, tracks = read_summary(folder), read_tracks(folder)
     if summary is None:
         raise RuntimeError(f"{folder}: no summary")
     obstacles = summary.obstacles or []
     end_s = _end_s(point, obstacles)
     vehicles = summary.vehicles
-    others = np.isin(tracks.vehicle, [*_others(tracks, obstacles)])
+    broken = {one.vehicle for one in obstacles if one.cause == BREAKDOWN}
+    driving = [number for number, name in enumerate(tracks.names) if name not in broken]
+    others = np.isin(tracks.vehicle, driving)
     return {
         "demanded": vehicles.demanded,
         "left": vehicles.left,
         "in_another_lane": vehicles.left - (vehicles.on_preferred_lane or 0),
         "overlaps": summary.safety.overlaps,
         "min_gap_m": summary.safety.min_gap_m,
-        "delay_s": _delay_s(trips),
+        "delay_s": round((summary.travel_time_s.by_entrance or {})[MAIN_ENTRANCE].delay, 2),
         "stopped": len(np.unique(tracks.vehicle[others & (tracks.speed_mps < STOPPED_MPS)])),
         "min_accel_mps2": round(float(tracks.accel_mps2[others].min()), 2),
         "emergency_brakes": summary.safety.emergency_brakes,
@@ -254,24 +240,8 @@ def metrics(folder: Path, scenario: Scenario, point: Point) -> dict[str, Any]:
     }
 
 
-def _delay_s(trips: Mapping[str, Mapping[str, Any]]) -> float:
-    """Return the mean delay of the vehicles that count."""
-    counted = [trip for trip in trips.values() if trip["counted"]]
-    return round(
-        float(np.mean([trip["travel_time_s"] - trip["free_flow_s"] for trip in counted])), 2
-    )
-
-
-def _others(tracks: Tracks, obstacles: Sequence[ObstacleFigures]) -> Iterator[int]:
-    """Yield the indices of the vehicles that have not broken down."""
-    broken = {one.vehicle for one in obstacles if one.cause == "breakdown"}
-    for number, name in enumerate(tracks.names):
-        if name not in broken:
-            yield number
-
-
 def _begins_s(point: Point) -> float:
-    """Return the road time at which the cause of a surprise begins."""
+    """Return the road time from which a surprise may begin: `at_s` of its table."""
     return float((point.breakdown or point.event or {}).get("at_s", 0.0))
 
 
@@ -291,7 +261,7 @@ def _used_again_s(
 ) -> float | None:
     """Return the time until a vehicle was in the middle of a part that had been opened."""
     for one in obstacles:
-        if one.cause == "closed" and one.opened_s is not None:
+        if one.cause == CLOSED and one.opened_s is not None:
             there = np.floor(tracks.y_m / scenario.road.lane_width_m) == one.lane
             there &= np.abs(tracks.s_m - 0.5 * (one.from_m + one.to_m)) < 5.0
             there &= tracks.t_s >= one.opened_s
@@ -315,58 +285,5 @@ def _free_again_s(tracks: Tracks, scenario: Scenario, point: Point, end_s: float
     return float(WINDOW_S * (len(free) - np.argmin(free[::-1]))) if not free.all() else 0.0
 
 
-@contextlib.contextmanager
-def _silence() -> Iterator[None]:
-    """Discard the log of a run."""
-    with Path(os.devnull).open("w", encoding="utf-8") as sink, contextlib.redirect_stdout(sink):
-        yield
-
-
-def jobs_of(only: Sequence[str], seeds: int | None) -> list[Job]:
-    """Return the runs of the points whose names contain one of the texts, seed by seed."""
-    chosen = [one for one in POINTS if not only or any(text in one.name for text in only)]
-    counts = {one.name: one.seeds if seeds is None else min(seeds, one.seeds) for one in chosen}
-    last = max(counts.values(), default=0)
-    return [Job(one, n) for n in range(1, last + 1) for one in chosen if n <= counts[one.name]]
-
-
-def main() -> int:
-    """Run the missing points and record their results."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--only", nargs="+", default=(), help="points whose names contain a text")
-    parser.add_argument("--again", action="store_true", help="repeat finished runs")
-    parser.add_argument("--seeds", type=int, help="number of seeds; default: that of the point")
-    parser.add_argument("--jobs", type=int, default=os.cpu_count(), help="parallel runs")
-    parser.add_argument("--json", type=Path, default=OUT, help="record")
-    options = parser.parse_args()
-    record, failed = options.json, False
-    known = json.loads(record.read_text(encoding="utf-8")) if record.exists() else {}
-    jobs = [
-        job for job in jobs_of(options.only, options.seeds) if options.again or job.key not in known
-    ]
-    # libsumo runs one simulation per process.
-    with ProcessPoolExecutor(
-        options.jobs, multiprocessing.get_context("spawn"), max_tasks_per_child=1
-    ) as pool:
-        waiting = {pool.submit(drive, job): job for job in jobs}
-        for done in as_completed(waiting):
-            job = waiting[done]
-            if (error := done.exception()) is not None:
-                sys.stderr.write(f"{job.key}: {error!r}\n")
-                failed = True
-                continue
-            known[job.key] = done.result()
-            order = [one.key for one in jobs_of((), None)]
-            rows = {key: known[key] for key in [*order, *known] if key in known}
-            write_atomically(record, json.dumps(rows, indent=1) + "\n")
-            sys.stderr.write(f"{time.strftime('%H:%M:%S')} {job.key} {shown(known[job.key])}\n")
-    return int(failed)
-
-
-def shown(row: Mapping[str, Any]) -> str:
-    """Return the results of a run in a line."""
-    return " ".join(f"{key}={value}" for key, value in row.items() if key not in ("point", "seed"))
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run_points(POINTS, drive, OUT / RECORD, __doc__))

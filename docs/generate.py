@@ -34,6 +34,7 @@ from command_reference import command_reference
 from conflict_drawing import counts, draw_conflicts
 from evaluation.evidence import read_evidence
 from evaluation.tables import document_parts
+from experiments import P
 from laneweave import methods, planners
 from laneweave.agents.host import AgentMetrics
 from laneweave.coordinator.ballots.ballot_round import BallotPhase
@@ -103,7 +104,7 @@ LONG = DOCS / "evidence" / "long-run.json"
 """Memory of long runs, by `benchmarks/long_run.py`."""
 STABILITY = DOCS / "evidence" / "stability.json"
 """Output of `benchmarks/stability.py`."""
-SURPRISES = DOCS / "evidence" / "surprises.json"
+SURPRISES = DOCS / "evidence" / surprises.RECORD
 """Output of `benchmarks/surprises.py`."""
 DECISIONS = DOCS / "adr"
 SCENARIO = DOCS / "SCENARIO.md"
@@ -557,13 +558,17 @@ def _stream() -> str:
 
 @cache
 def _road_runs() -> list[tuple[roads.Point, list[dict[str, Any]]]]:
-    """Return the measured points of `benchmarks/roads.py`, each with its runs by seed."""
-    rows = json.loads(ROADS.read_text(encoding="utf-8")).values()
-    runs = {
-        point: sorted((row for row in rows if row["point"] == point.name), key=itemgetter("seed"))
-        for point in roads.POINTS
-    }
-    return [(point, each) for point, each in runs.items() if each]
+    return _measured(roads.POINTS, ROADS)
+
+
+def _measured(points: Iterable[P], record: Path) -> list[tuple[P, list[dict[str, Any]]]]:
+    """Return the measured points of a benchmark, each with its runs by seed."""
+    rows = json.loads(record.read_text(encoding="utf-8")).values()
+    runs = [
+        (point, sorted((row for row in rows if row["point"] == point.name), key=itemgetter("seed")))
+        for point in points
+    ]
+    return [(point, each) for point, each in runs if each]
 
 
 def _road_results(*, faults: bool) -> str:
@@ -799,11 +804,7 @@ def _surprises() -> str:
         "in another lane", "overlaps", "acceleration", "flows freely again after",
     )  # fmt: skip
     lines = [f"| {' | '.join(headings)} |", "|---" * len(headings) + "|"]
-    rows = json.loads(SURPRISES.read_text(encoding="utf-8")).values()
-    for point in surprises.POINTS:
-        runs = [row for row in rows if row["point"] == point.name]
-        if not runs:
-            continue
+    for point, runs in _measured(surprises.POINTS, SURPRISES):
         delays_s = [run["delay_s"] for run in runs]
         free_s = [run["free_again_s"] for run in runs]
         free = "no" if None in free_s else f"{max(free_s):.0f} s"

@@ -7,13 +7,14 @@ from pathlib import Path
 from typing import Any
 
 import roads
+from experiments import jobs_of
 from support.tables import for_each
 
 EVIDENCE = Path(__file__).parents[3] / "docs" / "evidence" / roads.RECORD
 ROWS: dict[str, dict[str, Any]] = json.loads(EVIDENCE.read_text(encoding="utf-8"))
 RUNS = {
     job.key: (job.point, ROWS[job.key])
-    for job in roads.jobs_of((), None)
+    for job in jobs_of(roads.POINTS)
     if job.key in ROWS and job.point.label not in roads.REFERENCES
 }
 

@@ -31,7 +31,7 @@ from laneweave.protocol.wire.messages import Ballot, Census, VehicleState
 JUST_CLOSED_S = 1.0
 """Age (road time) up to which no leader can have planned for a closed formation."""
 HEED_S = 1.0
-"""Road time for which formations plan with the same closed parts once these have changed."""
+"""Minimum road time between two changes of the closed parts with which formations plan."""
 
 
 class FormationsOperation:
@@ -81,11 +81,11 @@ class FormationsOperation:
 
     def _heed_nothing(self) -> None:
         self._heeded: tuple[TemporaryClosure, ...] = ()
-        """These parts, with queues, as formations plan with them now."""
+        """Closed parts, and the queues before them, with which formations plan now."""
         self._heeded_s = -math.inf
-        """Road time from which they do so."""
+        """Road time of the last change of these."""
         self._heed_again_s = math.inf
-        """Road time at which they heed what has changed since."""
+        """Road time at which newer changes take effect; infinite: there are none."""
 
     def take_over(self) -> None:
         """Discard all formations; joined formations stay joined."""
@@ -165,10 +165,10 @@ class FormationsOperation:
                 leader.on_members(known, now_s)
 
     def _stages(self, census: Census, t_s: float) -> Sequence[Stage]:
-        """Return the stages of the road, with closed parts as they were up to `HEED_S` ago.
+        """Return the stages of the road; changes of closed parts take effect once in `HEED_S`.
 
-        Every formation may plan again when they change, and slow vehicles of other systems and
-        queues change them several times in a second.
+        After each change, every formation may plan again. Queues and slow vehicles of other systems
+        change parts several times in a second.
         """
         closed = with_queues(self._closed, census, self._scenario)
         if closed != self._heeded and t_s >= self._heeded_s + HEED_S:
@@ -179,7 +179,7 @@ class FormationsOperation:
     def _with_stage(
         self, formation: Formation, leader: FormationLeader, of_road: Sequence[Stage], t_s: float
     ) -> Formation:
-        """Return a formation with the stage of its leader, if that needs no other plan.
+        """Return a formation, with the stage its leader has planned for if that plan still serves.
 
         Parts that are closed for a time change the stages of formations that have passed them, and
         of those that need the same lanes as before. Where it is too late for a new plan, a new

@@ -19,7 +19,7 @@ from attrs import define, frozen
 
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.road_layout import (
-    ClearedPart,
+    NO_PARTS,
     LanePosition,
     LaneSection,
     TemporaryClosure,
@@ -93,8 +93,7 @@ class LaneEndControl:
         self._lattice = scenario.lattice
         self._queue_m = queue_pitch_m(scenario)
         self._any = False
-        self._cleared: tuple[ClearedPart, ...] = ()
-        self._closed: Sequence[TemporaryClosure] = ()
+        self._temporary = NO_PARTS
         self._ends: dict[LanePosition, LaneEnd] = {}
         """Dead ends by lane and end; those that have vanished as long as vehicles wait there."""
         self._sections: tuple[LaneSection, ...] = ()
@@ -111,21 +110,21 @@ class LaneEndControl:
         """Dead end at which each vehicle without cells waits or waited; None: its lane has none."""
         self.close(LaneEnds(scenario))
 
-    def close(self, lane_ends: LaneEnds, closed: Sequence[TemporaryClosure] = ()) -> None:
+    def close(self, lane_ends: LaneEnds) -> None:
         """Replace the ends of lanes.
 
         Args:
-            lane_ends: those of the road, and of parts that are closed for a time.
-            closed: these parts. One may vanish only when no vehicle waits there (`in_use`).
+            lane_ends: those of the road, and of parts that are closed for a time, which may
+                vanish only when no vehicle waits there (`in_use`).
         """
-        scenario, self._cleared = self._scenario, lane_ends.temporary.cleared
-        self._closed = closed
+        scenario, self._temporary = self._scenario, lane_ends.temporary
         self._ends = {(end.lane, end.end_m): end for end in lane_ends}
         self._any = bool(lane_ends)
         if self._ends:
             needed = re_entry(scenario)
             self._columns, self._room_m = needed.columns, needed.room_m
             self._distance_m = needed.distance_m
+        closed = self._temporary.closed
         self._sections = sections_to_lines(scenario, closed) if self._ends else ()
         # In a lane, those ahead get gaps first.
         farthest_first = sorted(self._ends, key=lambda at: (at[0], -at[1]))
@@ -258,13 +257,14 @@ class LaneEndControl:
         # Behind the first entry point of the lane, vehicles may own its cells.
         point = lane
         taken = self._meter.points_kept_free(point)
-        between = self._columns_between_gaps(taken, t_s)
         if own:
             # Others enter the lane only behind it. The vehicle ahead must have started before the
             # gap arrives. The gap before needs the longer to that vehicle the farther ahead it is.
             between = math.ceil(max(ahead_m - vehicle.state[0], 0.0) / self._lattice.pitch_m)
-        # Its own lane is closed beside the others only if no other part is closed elsewhere.
-        passes_parts = not own or any(part.lane != lane for part in self._closed)
+        else:
+            between = self._columns_between_gaps(taken, t_s)
+        # No vehicle passes a part in the lane of the part; it may pass parts of other lanes there.
+        passes_parts = not own or any(part.lane != lane for part in self._temporary.closed)
         last = self._last_gap_column.get(point, math.inf)
         if self._meter.next_column(point) < last - between:
             columns = self._meter.keep_free(point, self._columns, t_s, passes_parts=passes_parts)
@@ -422,7 +422,7 @@ class LaneEndControl:
                 and part.speed_mps > STANDING_MPS  # at rest, it may wait for this vehicle
                 and part.at(t_s)[0] < s_m + self._distance_m
                 and part.at(t_s + settles_s)[1] > s_m - vehicle.size[0]
-                for part in self._cleared
+                for part in self._temporary.cleared
             ):
                 continue  # for a fast vehicle of another system
             passed_s = t_s - self._lattice.passing_time_s(gap.columns[-1], s_m)

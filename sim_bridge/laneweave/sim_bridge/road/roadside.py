@@ -223,7 +223,7 @@ class Roadside:
             self._meter.most_in_column = self._lanes_past(closed)
             for vehicle in vehicles.values():
                 vehicle.close(self.lane_ends)
-            control.close(self.lane_ends, closed)
+            control.close(self.lane_ends)
         control.still_closed = obstacles.still_closed(t_s)
         self.publisher.obstacles, self.publisher.cleared = obstacles.parts, obstacles.cleared
         for vehicle in broken:

@@ -19,7 +19,7 @@ SCENARIO = Scenario()
 """S3 begins at 400 of 1000 m."""
 LATTICE = SCENARIO.lattice
 NOW_S = 1000.0
-"""On the clock of the node."""
+"""Time on the clock of the node."""
 BLOCKS = (0, 1, 2)
 
 
@@ -31,7 +31,7 @@ class Leading:
     """An operation that leads one formation, whose plan is in force."""
 
     def __init__(self, rear_m: float, known: TemporaryParts) -> None:
-        """Begin with a formation of two vehicles, whose rear is at a position."""
+        """Begin with a formation of two vehicles that ends at a position."""
         column = LATTICE.block_range(BLOCKS[-1])[0]
         self.t_s = LATTICE.passing_time_s(column, rear_m)
         numbers = count(1)

@@ -149,7 +149,7 @@ def test_gaps_leave_cells_for_the_vehicles_that_pass(volume: float, least: int, 
 def test_own_gaps_count_where_others_pass_another_part(
     monkeypatch: pytest.MonkeyPatch, *, elsewhere: bool
 ) -> None:
-    """A gap in a lane that is repaired takes no cell from those that pass, unless they use it."""
+    """A gap in the lane of a closed part counts only if vehicles pass another part in that lane."""
     found: list[tuple[int, bool]] = []
     keep_free = EntryMeter.keep_free
 
