@@ -19,15 +19,17 @@ from laneweave.launch.run.simulated_run import SimulatedRun
 from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.sim_bridge import core as bridge
 from laneweave.sim_bridge.recording import reports, ticks, trajectories, trips
+from laneweave.sim_bridge.road import entry
 
 BOUNDS: tuple[tuple[ModuleType, str], ...] = (
     (bridge, "REPORT_TICKS"),
     (reports, "MAX_SENDERS"),
+    (entry, "LOAD_S"),
     (ticks, "ROWS_PER_GROUP"),
     (trajectories, "TICKS_PER_GROUP"),
     (trips, "ROWS_PER_GROUP"),
 )
-"""Sizes of buffers, which would otherwise still grow during a short run."""
+"""Sizes of buffers, in entries or seconds, which would otherwise still grow during a short run."""
 SMALL = 10
 _Cache = type(lru_cache(id))
 """Class of functions with a cache, whose entries the collector knows as a dictionary."""

@@ -42,7 +42,7 @@ def test_nothing_grows_over_a_longer_time(
 def test_planted_leaks_are_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Groups, "forget_departed", lambda *_: None)
     monkeypatch.setattr(Trip, "is_final", lambda *_: False)
-    monkeypatch.setattr(Ticks, "_write_rows", lambda _: None)
+    monkeypatch.setattr(Ticks, "_write_rows", lambda *_, **__: None)
     growth = growth_of(tmp_path, monkeypatch, {}, first_s=30.0, phase_s=25.0)
     kinds = sorted(found.split()[0] for found in growth.growing())
     assert kinds == ["dict", "dict", "list"]
