@@ -11,7 +11,7 @@ from msgspec.structs import replace
 
 from laneweave.agents.core import AgentCore
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.road_layout import Exits, TemporaryClosure
+from laneweave.protocol.road_layout import Exits, LanePosition, TemporaryClosure
 from laneweave.protocol.scenario.vehicle_types import VehicleTypes
 from laneweave.protocol.vehicle.lane_end import LaneEnd, ReEntry
 from laneweave.protocol.vehicle.lane_ends import LaneEnds
@@ -265,6 +265,21 @@ def entrances_stay_open(*_: object) -> None:
 @breaks(OBSTACLES, RoadVehicle, "close")
 def controllers_do_not_know(*_: object) -> None:
     """Motion controllers do not learn which parts are closed."""
+
+
+@breaks(OBSTACLES, StopLinesAhead, "keep_out")
+def moves_into_closed_lanes_go_on(*_: object) -> bool:
+    """A vehicle whose move into a lane began when it was closed heeds what stands there."""
+    return False
+
+
+@breaks(OBSTACLES, LaneEndControl, "_may_start_at_gap")
+def gaps_only_after_the_repair(
+    _: object, control: LaneEndControl, at: LanePosition, vehicle: RoadVehicle
+) -> bool:
+    """Columns are kept free for a waiting vehicle only once the cause is over."""
+    now_s = control._gap_arrives_s(at, vehicle) - vehicle.state[0] / control._lattice.speed_mps
+    return control._may_start(at, vehicle, now_s)
 
 
 @breaks(OBSTACLES)

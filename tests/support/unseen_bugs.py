@@ -28,8 +28,10 @@ from laneweave.coordinator.operation import LogEntry
 from laneweave.coordinator.planning.rolling.problem import StreamPlan
 from laneweave.coordinator.rolling import operation as rolling
 from laneweave.coordinator.rolling import ownership, transfer
+from laneweave.coordinator.rolling.known_road import KnownRoad
 from laneweave.coordinator.rolling.operation import RollingOperation
 from laneweave.coordinator.rolling.ownership import States
+from laneweave.coordinator.rolling.transfer import CellTransfer
 from laneweave.protocol.lattice import Cell, footprint
 from laneweave.protocol.runtime.node import Compute, Computed, Effect, Listen
 from laneweave.protocol.scenario.fields import Scenario
@@ -261,9 +263,23 @@ def departed_member_ignored(
 
 
 @breaks("transfer", RollingOperation, "_with_partners", collides=False)
-def partners_not_asked(_: object, __: RollingOperation, names: Iterable[Name]) -> set[Name]:
+def partners_not_asked(
+    _: object, __: RollingOperation, names: Iterable[Name], ___: object
+) -> set[Name]:
     """The roster lacks the vehicles whose promises determine what a member owns."""
     return set(names)
+
+
+@breaks("transfer", CellTransfer, "_waits", collides=False)
+def replaced_ballots_not_awaited(*_: object) -> bool:
+    """A new plan for a slot is made before it is known who owns the cells of a replaced one."""
+    return False
+
+
+@breaks("transfer", KnownRoad, "_brakes", collides=False)
+def braking_vehicles_planned(*_: object) -> bool:
+    """Others need cells of vehicles that brake before a closed part, and wait for them."""
+    return False
 
 
 @breaks("transfer", transfer, "owned_cells")

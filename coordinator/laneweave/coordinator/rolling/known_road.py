@@ -8,14 +8,14 @@ blocked or held, so that ballots rarely fail; safety does not depend on it.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 from attrs import evolve, frozen
 
 from laneweave.coordinator.ballots.ballot_round import BallotPhase
 from laneweave.coordinator.planning.rolling.problem import MovingPart, OpenRoad, StreamVehicle
 from laneweave.coordinator.rolling.observed import Snapshot
-from laneweave.coordinator.rolling.ownership import certain_cells
+from laneweave.coordinator.rolling.ownership import cells_before
 from laneweave.coordinator.rolling.transfer import CellTransfer
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.road_layout import (
@@ -32,13 +32,16 @@ from laneweave.protocol.scenario.formation_table import READY_LATE_S
 from laneweave.protocol.vehicle.lane_ends import sections_to_lines
 from laneweave.protocol.vehicle.motion import DISPLACED_ALONG_M
 from laneweave.protocol.vehicle.sudden_stops import queue_pitch_m
-from laneweave.protocol.wire.messages import CensusEntry, Name, VehicleState
+from laneweave.protocol.wire.messages import Ballot, CensusEntry, Name, VehicleState
 
 LOOKAHEAD_M = 600.0
 """Distance before the first moves at which planning for a vehicle begins: the length of S3, so that
 all vehicles that can interact there are included in time."""
 MARGIN_COLUMNS = 10
 """Columns ahead of the foremost and behind the rearmost vehicle that plans may use."""
+
+GENTLE_BRAKING_MPS2 = 2.0
+"""Deceleration from which vehicles brake before a closed part of their lane."""
 
 
 @frozen
@@ -59,18 +62,23 @@ class KnownRoad:
         return self.scenario.timing.cycles_s[0]
 
     def vehicles_and_blocked_cells(
-        self, transfers: Sequence[CellTransfer]
+        self, transfers: Sequence[CellTransfer], temporary: TemporaryParts = NO_PARTS
     ) -> tuple[tuple[StreamVehicle, ...], frozenset[Cell]]:
         """Return the vehicles to plan for, and the cells that no plan may use.
 
         Args:
-            transfers: ballots for the slot before, and for this slot if it is planned again.
+            transfers: ballots for the slot before, and for this slot if it is planned again: their
+                vehicles will drop them.
+            temporary: parts of lanes that are not open as always.
         """
         snapshot, lattice = self.snapshot, self.scenario.lattice
+        t0_s = self.slot * self._slot_s
+        dropped = frozenset(each.ballot for each in transfers if each.t0_s > t0_s - 1e-6)
         vehicles: dict[Cell, StreamVehicle] = {}
         owned, reserved = set[Cell](), set[Cell]()
         far_m = self.scenario.geometry.moves_from_m - LOOKAHEAD_M
-        gated = self._gated(transfers)
+        gated = self._gated([each for each in transfers if each.ballot not in dropped])
+        ending = self._ending(temporary.closed)
         # Vehicles without a state come last: they may have moved, and others may hold their cells.
         for entry in sorted(
             snapshot.census.on_lattice, key=lambda entry: entry.vehicle not in snapshot.states
@@ -80,11 +88,13 @@ class KnownRoad:
             s_m = lattice.cell_s_m(cell[0], (self.slot - 1) * self._slot_s)
             if s_m < far_m:
                 continue
-            vehicle = self._vehicle(entry, state, s_m, gated=entry.vehicle in gated)
+            late = state is not None and (_is_late(state, dropped) or self._brakes(cell, ending))
+            vehicle = self._vehicle(entry, state, s_m, late=late, gated=entry.vehicle in gated)
             vehicles.setdefault(cell, vehicle)
             if state is not None:
-                owned |= certain_cells(state, snapshot.states, snapshot.gone)
-                reserved |= self._reserved(entry, state, gated=entry.vehicle in gated)
+                owned |= cells_before(state, snapshot.states, snapshot.gone, dropped)
+                keeps = late or entry.vehicle in gated
+                reserved |= self._reserved(entry, state, keeps_all=keeps)
         columns = [column for column, _ in vehicles] or [0]
         window = range(min(columns) - MARGIN_COLUMNS, max(columns) + MARGIN_COLUMNS + 1)
         blocked = frozenset(
@@ -138,6 +148,31 @@ class KnownRoad:
                 sections[number] = evolve(sections[number], to_m=queue_m)
         return sections
 
+    def _ending(self, closed: Sequence[TemporaryClosure]) -> list[tuple[LaneSection, float]]:
+        """Return the sections that end suddenly, up to the queue, and where the parts begin."""
+        always, found = len(self.scenario.geometry.sections), []
+        for section in self._open_sections(closed)[always:] if closed else ():
+            ahead = (part.from_m for part in closed if part.lane == section.lane)
+            found.append((section, min(each for each in ahead if each >= section.to_m)))
+        return found
+
+    def _brakes(self, cell: Cell, ending: Sequence[tuple[LaneSection, float]]) -> bool:
+        """Return whether a vehicle brakes before a closed part when the slot begins.
+
+        Out of its cell it is not ready for a plan, and the gates of all who needed it would stay
+        closed.
+        """
+        speed_mps = self.scenario.formation.speed_mps
+        braking_m = speed_mps**2 / (2.0 * GENTLE_BRAKING_MPS2)
+        s_m = self.scenario.lattice.cell_s_m(cell[0], self.t_s)
+        begins_m = self.scenario.lattice.cell_s_m(cell[0], self.slot * self._slot_s)
+        return any(
+            cell[1] == section.lane
+            and section.from_m <= s_m <= part_m
+            and begins_m + braking_m > section.to_m
+            for section, part_m in ending
+        )
+
     def _queue_begins_m(self, section: LaneSection) -> float:
         """Return where moves out of a section end that is closed suddenly.
 
@@ -159,7 +194,13 @@ class KnownRoad:
         return max(begins_m, section.from_m)
 
     def _vehicle(
-        self, entry: CensusEntry, state: VehicleState | None, s_m: float, *, gated: bool
+        self,
+        entry: CensusEntry,
+        state: VehicleState | None,
+        s_m: float,
+        *,
+        late: bool,
+        gated: bool,
     ) -> StreamVehicle:
         """Return a vehicle as the planner takes it; one without a state is held where it entered.
 
@@ -167,6 +208,7 @@ class KnownRoad:
             entry: its entry in the census.
             state: its state, if any.
             s_m: position of its cell at the beginning of the slot.
+            late: whether it takes no part in this slot, and keeps its cells.
             gated: whether it takes no part in this slot, see `_gated`.
         """
         targets, own = self._targets(entry, s_m), entry.vehicle_type
@@ -174,28 +216,27 @@ class KnownRoad:
             return StreamVehicle(entry.vehicle, entry.cell, targets, True, vehicle_type=own)
         settles = entry.ready_s > (self.slot - 1) * self._slot_s
         # States from an earlier term of this leader do not report current positions.
-        held = _is_late(state) or not state.attended or state.t_s < self.since_s - 1e-6
+        held = late or not state.attended or state.t_s < self.since_s - 1e-6
         held = held or (self._is_displaced(state) and not settles)
         ready_s = entry.ready_s - READY_LATE_S
         waits = max(int(gated), math.ceil(ready_s / self._slot_s - self.slot - 1e-9))
         moves = self.scenario.types.moves_of(own)
         return StreamVehicle(entry.vehicle, state.hold_cell, targets, held, moves, waits, own)
 
-    def _reserved(self, entry: CensusEntry, state: VehicleState, *, gated: bool) -> set[Cell]:
+    def _reserved(self, entry: CensusEntry, state: VehicleState, *, keeps_all: bool) -> set[Cell]:
         """Return the cells that a vehicle owns and will not give away in this slot."""
         owned, (column, lane) = state.record.owned, state.hold_cell
-        if gated or _is_late(state):
+        if keeps_all:
             return {*owned} - {state.hold_cell}
         if entry.ready_s > self.slot * self._slot_s:  # it may still be beside these cells
             return {cell for cell in owned if cell[1] == lane and cell[0] > column}
         return set()
 
     def _gated(self, transfers: Sequence[CellTransfer]) -> frozenset[Name]:
-        """Return members of ballots that are in force, and whose gates may not have opened.
+        """Return members of ballots in force whose gates wait for a settling vehicle.
 
-        These are ballots for this slot, which is planned again, and ballots for the slot before
-        whose gates wait for a settling vehicle. If one of them promised the next ballot, the gate
-        would stay closed.
+        These are ballots for the slot before. If a member promised the next ballot, the gate would
+        stay closed.
         """
         t0_s, states = (self.slot - 1) * self._slot_s, self.snapshot.states
         settling = {one.vehicle for one in self.snapshot.census.on_lattice if one.ready_s > t0_s}
@@ -204,13 +245,8 @@ class KnownRoad:
             for transfer in transfers
             if transfer.phase is BallotPhase.IN_FORCE
             and transfer.t0_s >= t0_s - 1e-6
-            and (
-                transfer.t0_s > self.t_s
-                or (
-                    not settling.isdisjoint(transfer.roster)
-                    and not any(states[one].go for one in transfer.roster if one in states)
-                )
-            )
+            and not settling.isdisjoint(transfer.roster)
+            and not any(states[one].go for one in transfer.roster if one in states)
             for name in transfer.roster
         )
 
@@ -245,9 +281,10 @@ class KnownRoad:
         return abs(state.s_m - cell_s_m) > lattice.pitch_m + DISPLACED_ALONG_M
 
 
-def _is_late(state: VehicleState) -> bool:
+def _is_late(state: VehicleState, dropped: Collection[Ballot]) -> bool:
     """Return whether a vehicle may still begin a move of the slot before: its gate is open.
 
-    With a closed gate it never begins once the vehicle promises the newer ballot.
+    With a closed gate it never begins once the vehicle promises the newer ballot. The moves of
+    ballots that are dropped are not due yet.
     """
-    return state.go and not state.done and not state.moving
+    return state.go and not state.done and not state.moving and state.record.accepted not in dropped

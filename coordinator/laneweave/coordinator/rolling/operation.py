@@ -10,7 +10,7 @@ starts from its cell.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from functools import partial
 from typing import Any
 
@@ -21,7 +21,7 @@ from laneweave.coordinator.planning.rolling.problem import StreamPlan
 from laneweave.coordinator.rolling.checked_planner import Planner
 from laneweave.coordinator.rolling.known_road import KnownRoad
 from laneweave.coordinator.rolling.observed import ObservedRoad
-from laneweave.coordinator.rolling.ownership import certain_cells, partners
+from laneweave.coordinator.rolling.ownership import cells_before, partners
 from laneweave.coordinator.rolling.transfer import TRANSFER_RULES, CellTransfer
 from laneweave.protocol.lattice import footprint
 from laneweave.protocol.road_layout import NO_PARTS, TemporaryParts
@@ -130,8 +130,13 @@ class RollingOperation:
         if transfer is None or not transfer.unfinished:
             return None
         transfer.on_state(state, self.observed.states, now_s)
-        if transfer.phase is BallotPhase.ABORTED:
-            return [_aborted(transfer)]
+        waiting = [each for each in self.transfers if each.dropped and each.unfinished]
+        for each in waiting:
+            each.plan_from_promises(self.observed.states, now_s)
+        changed = [transfer, *(each for each in waiting if each is not transfer)]
+        aborted = [_aborted(each) for each in changed if each.phase is BallotPhase.ABORTED]
+        if aborted:
+            return aborted
         if transfer.phase is BallotPhase.IN_FORCE and self.in_force == 1:
             slot = math.floor(transfer.t0_s / self._slot_s + 1e-6)
             begun_s = (slot - 1) * self._slot_s
@@ -191,7 +196,7 @@ class RollingOperation:
             self._scenario, self.observed.at(snapshot_s), snapshot_s, slot + 1, self._since[0]
         )
         self._parts_changed = False
-        vehicles, blocked = known.vehicles_and_blocked_cells(self.transfers)
+        vehicles, blocked = known.vehicles_and_blocked_cells(self.transfers, self._temporary)
         self._newest_slot = slot + 1
         job = self._new_job()
         self._ordered = (job, slot + 1)
@@ -211,23 +216,20 @@ class RollingOperation:
             return
         slot = self._ordered[1]
         self._ordered = None
+        t0_s = slot * self._slot_s
+        replaced = [each for each in self.transfers if each.t0_s > t0_s - 1e-6]
         yield from self._abort(self.transfers, "the next slot is planned")
-        in_force = [
-            each
-            for each in self.transfers
-            if each.phase is BallotPhase.IN_FORCE and each.t0_s > slot * self._slot_s - 1e-6
-        ]
         plan = computed.result
         if not isinstance(plan, StreamPlan):
             yield LogEntry(PLANNING_FAILED, {"slot": slot, "error": computed.error})
             return
         known = set() if self._last_plan is None else {*self._last_plan.missed}
         self._last_plan = plan
-        t0_s = slot * self._slot_s
-        if t_s > t0_s + MAX_DELAY_S:
+        # Moves of replaced ballots must not have begun.
+        if t_s > (t0_s if replaced else t0_s + MAX_DELAY_S):
             yield LogEntry(PLANNING_LATE, {"slot": slot})
             return
-        self.transfers = [*in_force, *self._make_transfers(plan, t0_s, now_s)]
+        self.transfers = [*self._make_transfers(plan, t0_s, now_s, replaced)]
         self._transfer_of = {name: each for each in self.transfers for name in each.roster}
         out_of_reach = [name for name in plan.missed if name not in known]
         yield LogEntry(STREAM_PLANNED, self._log_data(plan) | {"out_of_reach": out_of_reach})
@@ -246,13 +248,23 @@ class RollingOperation:
         }
 
     def _make_transfers(
-        self, plan: StreamPlan, t0_s: float, now_s: float
+        self, plan: StreamPlan, t0_s: float, now_s: float, replaced: Sequence[CellTransfer]
     ) -> Iterator[CellTransfer]:
+        """Yield the ballots for the first moves of a plan.
+
+        Args:
+            plan: paths of all vehicles.
+            t0_s: road time at which the slot begins.
+            now_s: node clock.
+            replaced: earlier ballots for this slot. Their vehicles drop their moves when they
+                promise a newer one; a ballot with the same vehicles and moves is kept instead.
+        """
         states, gone = self.observed.states, self.observed.gone
+        dropped = frozenset(each.ballot for each in replaced)
         owner = {
             cell: name
             for name, state in states.items()
-            for cell in certain_cells(state, states, gone)
+            for cell in cells_before(state, states, gone, dropped)
         }
         moves: dict[Name, Move] = {}
         rosters: dict[Name, set[Name]] = {}
@@ -266,12 +278,27 @@ class RollingOperation:
             cells = footprint(path[0], path[1])
             if all(cell in owner for cell in cells):
                 moves[name] = (path[0], path[1])
-                rosters[name] = self._with_partners({owner[cell] for cell in cells} | {name})
-        for roster in _clusters(rosters.values()):
+                owners = {owner[cell] for cell in cells} | {name}
+                rosters[name] = self._with_partners(owners, dropped)
+        same = {
+            each.roster: each
+            for each in replaced
+            if each.phase is BallotPhase.IN_FORCE
+            and each.moves == {name: moves[name] for name in each.roster if name in moves}
+        }
+        earlier = [{*roster} for roster in same]
+        earlier += [{name} for each in replaced if each.roster not in same for name in each.roster]
+        clusters = _clusters([*rosters.values(), *(each & states.keys() for each in earlier)])
+        for members in clusters:
+            roster = tuple(sorted(members))
+            if roster in same:
+                yield same[roster]
+                continue
             yield CellTransfer(
                 ballot=self._new_ballot(self._highest),
-                roster=tuple(sorted(roster)),
-                moves={name: moves[name] for name in sorted(roster) if name in moves},
+                roster=roster,
+                moves={name: moves[name] for name in roster if name in moves},
+                dropped=dropped,
                 t0_s=t0_s,
                 slot_s=self._slot_s,
                 resend_s=self._scenario.network.resend_s,
@@ -280,11 +307,17 @@ class RollingOperation:
                 rules=self._rules,
             )
 
-    def _with_partners(self, names: set[Name]) -> set[Name]:
-        """Add the vehicles whose promises determine what the others own."""
+    def _with_partners(self, names: set[Name], dropped: Collection[Ballot]) -> set[Name]:
+        """Add the vehicles whose promises determine what the others own.
+
+        The members of ballots that are dropped promise new ones in any case.
+        """
         roster, waiting, states = set(names), sorted(names), self.observed.states
         while waiting:
-            new = partners(states[waiting.pop()], states) - roster
+            state = states[waiting.pop()]
+            if state.record.transfer is not None and state.record.transfer.ballot in dropped:
+                continue
+            new = partners(state, states) - roster
             roster |= new
             waiting += sorted(new)
         return roster

@@ -11,7 +11,7 @@ from collections.abc import Collection, Mapping
 from enum import Enum
 
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.wire.messages import Name, PendingTransfer, VehicleState
+from laneweave.protocol.wire.messages import Ballot, Name, PendingTransfer, VehicleState
 
 States = Mapping[Name, VehicleState]
 
@@ -57,6 +57,21 @@ def certain_cells(
     if owned is not None or transfer is None:
         return owned or frozenset()
     return frozenset(transfer.before) & frozenset(transfer.after)
+
+
+def cells_before(
+    state: VehicleState, states: States, gone: Collection[Name], dropped: Collection[Ballot]
+) -> frozenset[Cell]:
+    """Return the cells that a vehicle owns for certain if ballots are dropped.
+
+    All members of these ballots will promise a higher one. Until their gates are known to be open,
+    the vehicle is expected to own the cells `before`.
+    """
+    transfer = state.record.transfer
+    if transfer is not None and transfer.ballot in dropped:
+        owned = owned_cells(state, states, gone)
+        return frozenset(transfer.before) if owned is None else owned
+    return certain_cells(state, states, gone)
 
 
 def partners(state: VehicleState, states: States) -> frozenset[Name]:

@@ -54,6 +54,9 @@ class CellTransfer(BallotRound):
     t0_s: float
     """Road time at which the moves begin."""
     slot_s: float
+    dropped: frozenset[Ballot] = frozenset()
+    """Earlier ballots for the slot, whose members all promise new ones. The plan waits until it is
+    known which cells they own then."""
     gone: frozenset[Name] = frozenset()
     """Departed vehicles that are in rosters of pending transfers."""
     reason: str = ""
@@ -69,9 +72,23 @@ class CellTransfer(BallotRound):
     def on_state(self, state: VehicleState, states: States, now_s: float) -> None:
         """Handle a newer state of a member; `states` are the newest states of all vehicles."""
         self.take(STATE, now_s, state)
-        if self.take(PROMISED, now_s):
+        self.plan_from_promises(states, now_s)
+
+    def plan_from_promises(self, states: States, now_s: float) -> None:
+        """Plan if all have promised, and what they own no longer depends on dropped ballots."""
+        if not self._waits(states) and self.take(PROMISED, now_s):
             plan = self._make_plan(states)
             self.take(PLANNED if isinstance(plan, Plan) else FAILED, now_s, plan)
+
+    def _waits(self, states: States) -> bool:
+        """Return whether a dropped ballot does not show yet who owns its cells."""
+        known = dict(states) | self.promises if self.dropped else {}
+        return any(
+            promise.record.transfer is not None
+            and promise.record.transfer.ballot in self.dropped
+            and owned_cells(promise, known, self.gone) is None
+            for promise in self.promises.values()
+        )
 
     def on_left(self, vehicle: Name) -> bool:
         """Abort because a member has left the road; return whether this ends the ballot."""
@@ -138,7 +155,8 @@ def record_unanswered(transfer: CellTransfer, reason: str) -> None:
     issuing = transfer.phase is BallotPhase.ISSUING
     answers = transfer.accepted if issuing else transfer.promises
     transfer.unanswered = tuple(name for name in transfer.roster if name not in answers)
-    awaited = first_names(transfer.unanswered, MAX_NAMED)
+    # All may have promised, while members of replaced ballots have not (`_waits`).
+    awaited = first_names(transfer.unanswered, MAX_NAMED) or "a member of a replaced ballot"
     transfer.reason = f"{reason}, and {awaited} did not answer"
 
 

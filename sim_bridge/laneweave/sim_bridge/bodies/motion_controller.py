@@ -378,13 +378,15 @@ class MotionController:
 
     def step(self, tick: int) -> None:
         """Advance from `tick` to the next one."""
-        measured, plant = self.measured, self.plant
+        measured, plant, seen, t_s = self.measured, self.plant, self.stop_lines, tick * self.tick_s
         near: Sequence[Neighbour] = self.neighbours.ahead
+        kept_out = bool(seen.lane_ends) and self.off_lattice is None
+        if kept_out:
+            kept_out = seen.keep_out(self.hold_cell, self._body_lane, t_s, near, measured[1])
         if near:
-            near = self._relevant(near, measured[3])
-        stays = self._must_stay_in_lane(tick)
-        if self.stop_lines.lane_ends and self.broken_mps2 is None:
-            t_s, seen = tick * self.tick_s, self.stop_lines
+            near = self._relevant(near, measured[3], enters=not kept_out)
+        stays = kept_out or self._must_stay_in_lane(tick)
+        if seen.lane_ends and self.broken_mps2 is None:
             near = [*near, *seen.lines(measured, self.hold_cell, t_s, enters=not stays)]
         level, jerk = self._next(tick, near, stays=stays)
         if near and self._must_brake(measured, jerk, near):
@@ -466,8 +468,6 @@ class MotionController:
         s_m, speed_mps = self.measured[:2]
         columns = self.motion.origin[0], self.hold_cell[0]
         t_s = tick * self.tick_s
-        if self.stop_lines.lane_ends.has_passed(self.hold_cell, t_s):
-            return True  # the other lane has ended meanwhile
         if self.has_missed_exit(t_s):
             return True
         rear_m = self.lattice.cell_s_m(min(columns), t_s) - DISPLACED_ALONG_M
@@ -491,8 +491,10 @@ class MotionController:
             return spare_m < RELEASE_M + measured[1] * tick_s
         return spare_m < 0.0
 
-    def _relevant(self, others: Iterable[Neighbour], y_m: float) -> list[Neighbour]:
+    def _relevant(
+        self, others: Iterable[Neighbour], y_m: float, *, enters: bool
+    ) -> list[Neighbour]:
         """Return the neighbours in lanes that the body touches or enters."""
         first, last = self.lattice.lanes_touched(y_m, self._limits.width_m)
-        goal = self.hold_cell[1]
+        goal = self.hold_cell[1] if enters else first
         return [other for other in others if first <= other.lane <= last or other.lane == goal]

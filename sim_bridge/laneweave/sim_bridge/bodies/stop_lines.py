@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 from attrs import Factory, define
 
 from laneweave.protocol.lattice import Cell
@@ -16,6 +18,8 @@ MAX_LINE_GAP_M = 200.0
 """Distance from which stop lines are seen; more than any stopping distance."""
 STANDING_MPS = 0.3
 """Speed below which a vehicle stands."""
+SLOWER_MPS = 2.0
+"""A vehicle that is slower than another one by this much holds it up."""
 
 
 @define
@@ -27,8 +31,41 @@ class StopLinesAhead:
     lane_ends: LaneEnds = Factory(lambda self: LaneEnds(self._scenario), takes_self=True)
     passed: bool = False
     """Whether the vehicle has started from standing at a stop line."""
+    _kept_out: bool = False
+    """See `keep_out`."""
     _past: LaneEnd | None = None
     """Beginning of a part of its lane that is open again: it has started there, and passes it."""
+
+    def keep_out(
+        self,
+        hold_cell: Cell,
+        body_lane: int,
+        t_s: float,
+        ahead: Iterable[Neighbour],
+        speed_mps: float,
+    ) -> bool:
+        """Return whether the lane of a move has ended before the body has entered it.
+
+        The vehicle drives past in its own lane, in which nobody is led into its cell, until nobody
+        in the other lane slows down ahead of it: the closed part grows while a vehicle breaks down.
+
+        Args:
+            hold_cell: cell that the vehicle holds or moves to.
+            body_lane: its lane if the body touches it, otherwise that of the body.
+            t_s: road time.
+            ahead: measured neighbours ahead.
+            speed_mps: speed of the vehicle.
+        """
+        goal = hold_cell[1]
+        if body_lane == goal:
+            self._kept_out = False
+        elif self.lane_ends.has_passed(hold_cell, t_s):
+            self._kept_out = True
+        elif self._kept_out:
+            self._kept_out = any(
+                one.lane == goal and one.speed_mps < speed_mps - SLOWER_MPS for one in ahead
+            )
+        return self._kept_out
 
     def start(self, goal: int, lane: int, s_m: float) -> None:
         """Start from standing towards a lane, from a position in another or the same one."""

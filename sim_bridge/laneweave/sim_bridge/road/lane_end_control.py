@@ -13,7 +13,7 @@ enters them is a formation of its own.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 
 from attrs import define, frozen
 
@@ -100,8 +100,9 @@ class LaneEndControl:
         """Those of the road, up to the stop lines in them."""
         self._columns, self._distance_m, self._room_m = 0, 0.0, 0.0
         self._gaps: dict[LanePosition, list[Gap]] = {}
-        self.still_closed: Sequence[TemporaryClosure] = ()
-        """Parts that are closed for a time, and whose cause lasts."""
+        self.still_closed: Callable[[float], Sequence[TemporaryClosure]] = lambda _: ()
+        """Returns the parts that are closed for a time whose cause lasts, as far as is known, at a
+        road time."""
         self._last_gap_column: dict[int, float] = {}
         """Rearmost column of the last gap, by entry point."""
         self._entered_gaps: list[range] = []
@@ -172,21 +173,23 @@ class LaneEndControl:
         for name, vehicle in vehicles.items():
             yield from self._leave(name, vehicle, t_s)
         for at, gaps in self._gaps.items():
-            startable = self._startable(at, vehicles)
+            waiting = self._waiting(at, vehicles)
+            startable = [one for one in waiting if self._may_start(at, one, t_s)]
             if startable and not self._blocking(startable[0], at, vehicles):
-                usable = [gap for gap in gaps if self._may_take(gap, at, startable[0])]
+                usable = [gap for gap in gaps if self._may_take(gap, at, startable[0], t_s)]
                 yield from self._start(startable[0], usable, t_s)
-                startable = self._startable(at, vehicles)
+                waiting = self._waiting(at, vehicles)
+            startable = [one for one in waiting if self._may_start_at_gap(at, one)]
             yield from self._arrive(gaps, vehicles, t_s)
             blocking = self._blocking(startable[0], at, vehicles) if startable else []
-            if not all(self._may_start(its_end, one) for its_end, one in blocking):
+            if not all(self._may_start_at_gap(its_end, one) for its_end, one in blocking):
                 startable = []
             last_m = max([self._ends[at].line_m, *(one.state[0] for one in startable[:1])])
             gaps[:] = [gap for gap in gaps if gap.vehicle or not self._is_over(gap, last_m, t_s)]
             free = [gap for gap in gaps if gap.vehicle is None]
             ahead_m = min((one.state[0] for _, one in blocking), default=-math.inf)
             for vehicle in startable:
-                own = next((gap for gap in free if self._may_take(gap, at, vehicle)), None)
+                own = next((gap for gap in free if self._will_take(gap, at, vehicle)), None)
                 if own is None:
                     self._request(at, vehicle, gaps, t_s, ahead_m)
                     break
@@ -250,8 +253,9 @@ class LaneEndControl:
             t_s: road time.
             ahead_m: front of the vehicle that gets the gap before; -inf: there is none.
         """
-        own = self._starts_in_own_lane(at, vehicle)
-        lane = at[0] if own else self._beside(at, vehicle)
+        arrives_s = self._gap_arrives_s(at, vehicle)
+        own = self._starts_in_own_lane(at, vehicle, arrives_s)
+        lane = at[0] if own else self._beside(at, vehicle, arrives_s)
         if lane is None:
             return  # SUMO takes the vehicle back, or it waits until a lane is open
         # Behind the first entry point of the lane, vehicles may own its cells.
@@ -293,8 +297,12 @@ class LaneEndControl:
             return max_columns
         return max(min_columns, math.ceil(gap_cells / spare_cells) - columns)
 
-    def _is_open(self, at: LanePosition, vehicle: RoadVehicle) -> bool:
-        """Return whether a vehicle can drive on in its lane, beyond a dead end.
+    def _gap_arrives_s(self, at: LanePosition, vehicle: RoadVehicle) -> float:
+        """Return the road time at which the next gap in the lane of a vehicle would pass it."""
+        return self._lattice.passing_time_s(self._meter.next_column(at[0]), vehicle.state[0])
+
+    def _is_open(self, at: LanePosition, vehicle: RoadVehicle, at_s: float) -> bool:
+        """Return whether a vehicle can drive on in its lane at a road time, beyond a dead end.
 
         The causes of all that is closed there are over, or its body is beyond.
         """
@@ -303,7 +311,7 @@ class LaneEndControl:
             end.sudden
             and not any(
                 part.lane == end.lane and s_m < part.to_m and part.from_m < end.reopens_m
-                for part in self.still_closed
+                for part in self.still_closed(at_s)
             )
         )
 
@@ -314,18 +322,18 @@ class LaneEndControl:
             if other.lane == end.lane and other.end_m > end.end_m and s_m < other.reopens_m:
                 yield other
 
-    def _starts_in_own_lane(self, at: LanePosition, vehicle: RoadVehicle) -> bool:
-        """Return whether a vehicle may start in its own lane, from where it waits.
+    def _starts_in_own_lane(self, at: LanePosition, vehicle: RoadVehicle, at_s: float) -> bool:
+        """Return whether a vehicle may start in its own lane at a road time, from where it waits.
 
         The lane is open, and the vehicle settles before the line of the next dead end.
         """
         settles_m = max(self._ends[at].reopens_m, vehicle.state[0]) + self._distance_m
-        return self._is_open(at, vehicle) and all(
+        return self._is_open(at, vehicle, at_s) and all(
             other.line_m >= settles_m for other in self._later(at, vehicle)
         )
 
-    def _beside(self, at: LanePosition, vehicle: RoadVehicle) -> int | None:
-        """Return the lane into which a vehicle at a dead end re-enters; None: there is none now.
+    def _beside(self, at: LanePosition, vehicle: RoadVehicle, at_s: float) -> int | None:
+        """Return the lane into which a vehicle at a dead end re-enters at a road time, if any.
 
         It needs room in its own lane until it is out of it.
         """
@@ -334,7 +342,7 @@ class LaneEndControl:
             return None
         if not self._is_before_line(at, vehicle):
             room_m = min((one.end_m for one in self._later(at, vehicle)), default=math.inf) - s_m
-            if room_m < self._room_m or not self._is_open(at, vehicle):
+            if room_m < self._room_m or not self._is_open(at, vehicle, at_s):
                 return None
             starts_m = s_m
         else:
@@ -346,19 +354,36 @@ class LaneEndControl:
         """Return whether a vehicle waits at the stop line before a dead end, or before it."""
         return vehicle.state[0] <= self._ends[at].line_m + NEAR_LINE_M
 
-    def _may_start(self, at: LanePosition, vehicle: RoadVehicle) -> bool:
-        """Return whether a vehicle drives, and has room to start from where it waits."""
-        return vehicle.controller.broken_mps2 is None and (
-            self._is_before_line(at, vehicle)
-            or self._starts_in_own_lane(at, vehicle)
-            or self._beside(at, vehicle) is not None
+    def _may_start(self, at: LanePosition, vehicle: RoadVehicle, at_s: float) -> bool:
+        """Return whether a vehicle drives at a road time, and has room to start where it waits.
+
+        One that has broken down blocks its own lane, from where it stands, until it is repaired.
+        """
+        breaks_down = vehicle.controller.broken_mps2 is not None
+        if breaks_down and vehicle.state[1] > STANDING_MPS:
+            return False
+        return self._starts_in_own_lane(at, vehicle, at_s) or (
+            not breaks_down
+            and (self._is_before_line(at, vehicle) or self._beside(at, vehicle, at_s) is not None)
         )
 
-    def _may_take(self, gap: Gap, at: LanePosition, vehicle: RoadVehicle) -> bool:
-        """Return whether a vehicle can start into a gap from where it waits now."""
+    def _may_start_at_gap(self, at: LanePosition, vehicle: RoadVehicle) -> bool:
+        """Return whether a vehicle may start when the next gap would pass it.
+
+        So those that wait for a part whose end is known get gaps that arrive soon after it.
+        """
+        return self._may_start(at, vehicle, self._gap_arrives_s(at, vehicle))
+
+    def _may_take(self, gap: Gap, at: LanePosition, vehicle: RoadVehicle, at_s: float) -> bool:
+        """Return whether a vehicle can start into a gap at a road time from where it waits."""
         if gap.lane == at[0]:
-            return self._starts_in_own_lane(at, vehicle)
-        return gap.lane == self._beside(at, vehicle)
+            return self._starts_in_own_lane(at, vehicle, at_s)
+        return gap.lane == self._beside(at, vehicle, at_s)
+
+    def _will_take(self, gap: Gap, at: LanePosition, vehicle: RoadVehicle) -> bool:
+        """Return whether a vehicle can start into a gap when it passes."""
+        passes_s = self._lattice.passing_time_s(gap.columns[-1], vehicle.state[0])
+        return self._may_take(gap, at, vehicle, passes_s)
 
     def take_off(self, name: Name, vehicle: RoadVehicle) -> LaneEndChange:
         """Take a vehicle off the lattice that has broken down, or whose lane ends."""
@@ -374,12 +399,6 @@ class LaneEndControl:
         ends = [at for at in self._ends if at[0] == lane]
         ahead = (at for at in ends if s_m < self._ends[at].reopens_m)
         return next(ahead, ends[-1] if ends else None)
-
-    def _startable(
-        self, at: LanePosition, vehicles: Mapping[Name, RoadVehicle]
-    ) -> list[RoadVehicle]:
-        """Return the vehicles that may start from where they wait, foremost first."""
-        return [one for one in self._waiting(at, vehicles) if self._may_start(at, one)]
 
     def _blocking(
         self, vehicle: RoadVehicle, at: LanePosition, vehicles: Mapping[Name, RoadVehicle]

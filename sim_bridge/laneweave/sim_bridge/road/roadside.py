@@ -162,6 +162,7 @@ class Roadside:
         self._lane_ends = LaneEndControl(scenario, self._meter)
         self._scenario = scenario
         self.obstacles = Obstacles(scenario, breakdowns)
+        self._lane_ends.still_closed = self.obstacles.still_closed
         self._temporary = NO_PARTS
         self._told: tuple[Obstacle, ...] = ()
         """Obstacles of which events have been logged."""
@@ -224,7 +225,6 @@ class Roadside:
             for vehicle in vehicles.values():
                 vehicle.close(self.lane_ends)
             control.close(self.lane_ends)
-        control.still_closed = obstacles.still_closed(t_s)
         self.publisher.obstacles, self.publisher.cleared = obstacles.parts, obstacles.cleared
         for vehicle in broken:
             yield control.take_off(vehicle.name, vehicle)

@@ -32,6 +32,7 @@ from laneweave.protocol.runtime.node import Compute, Computed
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.formation_table import READY_LATE_S, SNAPSHOT_S
 from laneweave.protocol.vehicle.lane_ends import re_entry
+from laneweave.protocol.wire.events import PLANNING_LATE
 from laneweave.protocol.wire.messages import (
     Ballot,
     Census,
@@ -212,15 +213,88 @@ def test_a_slot_that_begins_soon_is_not_planned_again() -> None:
     assert len(call.now.sections) == 4
 
 
-def test_vehicles_in_force_are_left_alone_when_a_slot_is_planned_again() -> None:
-    desk = bench(A, B, ways={A: ((0, 0), (1, 0))})
+def planned_again(desk: Bench, *ways: dict[str, tuple[Cell, ...]]) -> CellTransfer:
+    """Plan twice, the second time with a part closed; return the ballot in force before."""
     desk.think()
-    transfer = desk.transfer
-    transfer.phase = BallotPhase.IN_FORCE
-    desk.control.on_obstacles(TemporaryParts((PART,)))
+    earlier = desk.transfer
+    plan = run_ballot(desk)
+    transfers = [
+        PendingTransfer(plan.ballot, plan.before[name], plan.after[name], (A, B)) for name in (A, B)
+    ]
+    desk.hear(
+        *(
+            changed(
+                shown(name, plan.ballot, transfer, accepted=True, done=name != A, go=name == A),
+                t_s=BEGUN_S + 1.1,
+            )
+            for name, transfer in zip((A, B), transfers, strict=True)
+        )
+    )
+    assert earlier.phase is BallotPhase.IN_FORCE
+    desk.ways = ways[0] if ways else desk.ways
+    desk.control.on_obstacles(TemporaryParts((PART._replace(lane=2),)))
+    return earlier
+
+
+def test_a_ballot_with_the_same_moves_is_kept_when_a_slot_is_planned_again() -> None:
+    desk = bench(A, B, ways={A: ((0, 0), (0, 1))})
+    earlier = planned_again(desk)
+    desk.think(LOOK_S + 1.0)
+    assert desk.control.transfers == [earlier]
+
+
+def test_a_ballot_with_other_moves_is_replaced_when_a_slot_is_planned_again() -> None:
+    desk = bench(A, B, ways={A: ((0, 0), (0, 1))})
+    earlier = planned_again(desk, {})
     call = desk.call(LOOK_S + 1.0)
-    assert {name for name, one in call.vehicles.items() if one.waits} == set(transfer.roster)
-    assert transfer in desk.control.transfers
+    assert not any(one.held or one.waits for one in call.vehicles.values())
+    assert (0, 1) not in call.blocked
+    # All drop the move when they promise, also the one whose gate is open.
+    prepares = dict(desk.control.outgoing(50.0))
+    assert {*prepares} == {A, B}
+    assert all(
+        isinstance(one, Prepare) and one.ballot > earlier.ballot for one in prepares.values()
+    )
+    assert [one.roster for one in desk.control.transfers] == [(A,), (B,)]
+
+
+@pytest.mark.parametrize(("from_m", "brakes"), [(800.0, False), (640.0, True), (500.0, True)])
+def test_one_that_brakes_before_a_closed_part_keeps_its_cells(from_m: float, brakes: bool) -> None:
+    """B is at 487 m, and at 570 m when the slot begins; the stop line is 60 m before the part."""
+    desk = bench(A, B)
+    desk.control.on_obstacles(TemporaryParts((TemporaryClosure(1, from_m, from_m + 50.0),)))
+    call = desk.call()
+    assert call.vehicles[B].held == brakes
+    assert not call.vehicles[A].held
+    assert ({*OWNED[B]} - {HOMES[B]} <= call.blocked) == brakes
+
+
+def test_nothing_is_replaced_once_the_slot_has_begun() -> None:
+    desk = bench(A, B, ways={A: ((0, 0), (0, 1))})
+    earlier = planned_again(desk, {})
+    compute = desk.order(LOOK_S + 1.0)
+    assert compute is not None
+    (note,) = desk.finish(compute, BEGUN_S + SLOT_S + 0.1)
+    assert note.kind == PLANNING_LATE
+    assert desk.control.transfers == [earlier]
+
+
+def test_a_new_plan_waits_until_it_is_known_who_owns_the_cells_of_a_replaced_ballot() -> None:
+    desk = bench(A, B, ways={A: ((0, 0), (0, 1))})
+    earlier = planned_again(desk, {A: ((0, 0), (1, 0))})
+    desk.think(LOOK_S + 1.0)
+    ballot_of = {one.roster: one.ballot for one in desk.control.transfers}
+    transfer = desk.control.transfers[0]
+    assert transfer.roster == (A,)
+    assert transfer.dropped == {earlier.ballot}
+    for name in (A, B):
+        assert transfer.phase is BallotPhase.PREPARING
+        before, after = (OWNED[name], (HOMES[name],))
+        pending = PendingTransfer(earlier.ballot, before, after, (A, B))
+        desk.hear(changed(shown(name, ballot_of[name,], pending), t_s=BEGUN_S + 2.0))
+    assert transfer.phase is BallotPhase.ISSUING
+    assert transfer.plan is not None
+    assert {*transfer.plan.before[A]} == {*OWNED[A]}
 
 
 @pytest.mark.parametrize(("from_m", "waits"), [(800.0, 0), (700.0, 1)])

@@ -22,9 +22,10 @@ from laneweave.protocol.wire.events import (
 )
 from laneweave.protocol.wire.messages import Name, OffLattice
 from laneweave.protocol.wire.obstacle_messages import BREAKDOWN, CLOSED, Obstacle
+from laneweave.sim_bridge.bodies.motion_controller import OffLatticePhase
 from laneweave.sim_bridge.bodies.stop_lines import STANDING_MPS
 from laneweave.sim_bridge.road.entry import EntryMeter
-from laneweave.sim_bridge.road.lane_end_control import CROWDED_GAPS, OPEN_GAPS
+from laneweave.sim_bridge.road.lane_end_control import CROWDED_GAPS, OPEN_GAPS, Gap
 from laneweave.sim_bridge.road.obstacles import ActiveObstacle, Breakdown
 from support import road_bugs
 from support.bugs import Bug, catches
@@ -118,13 +119,43 @@ def test_a_vehicle_that_breaks_down_is_an_obstacle_until_all_have_passed_it(
     assert obstacle.vehicle in names(road, LEFT_LATTICE)
 
 
-def test_no_gap_is_kept_free_for_a_vehicle_before_it_is_repaired() -> None:
+def test_a_gap_passes_a_vehicle_as_soon_as_it_is_repaired() -> None:
+    check_that_a_gap_passes_when_it_is_repaired()
+
+
+def check_that_a_gap_passes_when_it_is_repaired() -> None:
     road = lonely_road(BREAKS_DOWN)
-    while road.t_s < AT_S + STANDS_S:
+    while not any(one.stands for one in road.roadside.obstacles.active):
         road.step()
-        gaps = road.roadside._lane_ends._gaps.values()
-        assert LANE not in {gap.lane for each in gaps for gap in each}
-    assert names(road, LEFT_LATTICE)
+        assert LANE not in gaps_of(road)  # nobody knows when it will be repaired
+    (obstacle,) = road.roadside.obstacles.active
+    vehicle = road.vehicles[obstacle.vehicle or Name("none")]
+    repaired_s, passes_s = obstacle.until_s, list[float]()
+    while vehicle.controller.off_lattice is OffLatticePhase.WAITING:
+        road.step()
+        passes_s += [
+            ROAD.lattice.passing_time_s(gap.columns[0], vehicle.state[0])
+            for gap in gaps_of(road).get(LANE, [])
+        ]
+    assert min(passes_s) >= repaired_s
+    assert road.t_s <= repaired_s + re_entry(ROAD).columns + 2.0
+
+
+def test_no_gap_is_kept_free_for_a_vehicle_that_is_never_repaired() -> None:
+    road = lonely_road(evolve(BREAKS_DOWN, for_s=math.inf))
+    while road.t_s < AT_S + 5.0 * STANDS_S:
+        road.step()
+        assert LANE not in gaps_of(road)
+    assert names(road, ENTERED_LATTICE)
+
+
+def gaps_of(road: LonelyRoad) -> dict[int, list[Gap]]:
+    """Return the gaps by lane."""
+    found: dict[int, list[Gap]] = {}
+    for gaps in road.roadside._lane_ends._gaps.values():
+        for gap in gaps:
+            found.setdefault(gap.lane, []).append(gap)
+    return found
 
 
 @pytest.mark.parametrize(
@@ -132,12 +163,11 @@ def test_no_gap_is_kept_free_for_a_vehicle_before_it_is_repaired() -> None:
     [(600.0, OPEN_GAPS, OPEN_GAPS + 1), (1800.0, CROWDED_GAPS - 1, CROWDED_GAPS)],
 )
 def test_gaps_leave_cells_for_the_vehicles_that_pass(volume: float, least: int, most: int) -> None:
-    road = lonely_road(BREAKS_DOWN, volume=volume)
+    road = lonely_road(evolve(BREAKS_DOWN, for_s=math.inf), volume=volume)
     seen: set[range] = set()
     while len(seen) < 2:
         road.step()
-        gaps = road.roadside._lane_ends._gaps.values()
-        seen |= {gap.columns for each in gaps for gap in each}
+        seen |= {gap.columns for gaps in gaps_of(road).values() for gap in gaps}
     ahead, behind = sorted(seen, key=lambda kept: -kept.start)
     columns = re_entry(ROAD).columns
     assert least * columns <= ahead.start - behind.stop <= most * columns
@@ -205,6 +235,28 @@ def test_the_vehicle_slows_down_as_given_stands_as_long_as_given_and_is_where_it
             assert front_m <= parts[-1].to_m
     assert moves_s - stands_s >= STANDS_S
     assert parts[-1].until_s == pytest.approx(stands_s + STANDS_S, abs=0.3)
+
+
+def test_one_whose_move_into_the_lane_has_just_begun_drives_past_in_its_own_lane() -> None:
+    check_that_one_whose_move_has_just_begun_drives_past()
+
+
+def check_that_one_whose_move_has_just_begun_drives_past() -> None:
+    road = lonely_road(BREAKS_DOWN, volume=1500.0)
+    while not road.roadside.obstacles.active:
+        road.step()
+    line_m = next(iter(road.roadside.lane_ends)).line_m
+    beside = [one for one in road.vehicles.values() if line_m < one.state[0] < AT_M - 5.0]
+    moved = next(one for one in beside if one.body_lane != LANE)
+    origin = moved.controller.hold_cell
+    moved.controller._guard.moving_from = origin
+    moved.controller.hold_cell = (origin[0], LANE)
+    while moved.name in road.vehicles:
+        road.step()
+        assert road.overlaps == []
+        assert moved.state[1] > 0.5 * ROAD.lattice.speed_mps
+        assert moved.state[0] > AT_M + 50.0 or moved.body_lane == origin[1]
+    assert moved.body_lane == LANE
 
 
 def test_others_stop_at_the_line_or_behind_it_and_never_touch_the_vehicle() -> None:
@@ -371,6 +423,7 @@ BUGS: tuple[Bug, ...] = (
     road_bugs.late_vehicles_do_not_stop, road_bugs.broken_vehicles_drive_on,
     road_bugs.parts_are_closed_around_vehicles, road_bugs.gaps_end_at_the_line,
     road_bugs.entrances_stay_open, road_bugs.controllers_do_not_know,
+    road_bugs.moves_into_closed_lanes_go_on, road_bugs.gaps_only_after_the_repair,
 )  # fmt: skip
 
 
@@ -378,6 +431,8 @@ def check_all() -> None:
     for make in ROADS:
         run_to_end(make(), ENOUGH_S)
     check_that_those_at_the_line_drive_out_meanwhile()
+    check_that_a_gap_passes_when_it_is_repaired()
+    check_that_one_whose_move_has_just_begun_drives_past()
     check_that_nobody_enters_while_all_lanes_are_closed()
 
 
