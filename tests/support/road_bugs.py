@@ -278,7 +278,7 @@ def gaps_only_after_the_repair(
     _: object, control: LaneEndControl, at: LanePosition, vehicle: RoadVehicle
 ) -> bool:
     """Columns are kept free for a waiting vehicle only once the cause is over."""
-    now_s = control._gap_arrives_s(at, vehicle) - vehicle.state[0] / control._lattice.speed_mps
+    now_s = control._gap_arrives_s(at[0], vehicle) - vehicle.state[0] / control._lattice.speed_mps
     return control._may_start(at, vehicle, now_s)
 
 

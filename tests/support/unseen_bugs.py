@@ -30,7 +30,7 @@ from laneweave.coordinator.rolling import operation as rolling
 from laneweave.coordinator.rolling import ownership, transfer
 from laneweave.coordinator.rolling.known_road import KnownRoad
 from laneweave.coordinator.rolling.operation import RollingOperation
-from laneweave.coordinator.rolling.ownership import States
+from laneweave.coordinator.rolling.ownership import ReplacedBallots, States
 from laneweave.coordinator.rolling.transfer import CellTransfer
 from laneweave.protocol.lattice import Cell, footprint
 from laneweave.protocol.runtime.node import Compute, Computed, Effect, Listen
@@ -263,17 +263,20 @@ def departed_member_ignored(
 
 
 @breaks("transfer", RollingOperation, "_with_partners", collides=False)
-def partners_not_asked(
-    _: object, __: RollingOperation, names: Iterable[Name], ___: object
-) -> set[Name]:
+def partners_not_asked(_: object, __: RollingOperation, names: Iterable[Name]) -> set[Name]:
     """The roster lacks the vehicles whose promises determine what a member owns."""
     return set(names)
 
 
-@breaks("transfer", CellTransfer, "_waits", collides=False)
+@breaks("transfer", CellTransfer, "_awaits_replaced", collides=False)
 def replaced_ballots_not_awaited(*_: object) -> bool:
     """A new plan for a slot is made before it is known who owns the cells of a replaced one."""
     return False
+
+
+@breaks("transfer", ReplacedBallots, "on_state", collides=False)
+def evidence_is_not_kept(*_: object) -> None:
+    """Leaders forget what a vehicle has shown about a replaced ballot when it has a newer one."""
 
 
 @breaks("transfer", KnownRoad, "_brakes", collides=False)

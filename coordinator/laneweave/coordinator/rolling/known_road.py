@@ -8,14 +8,14 @@ blocked or held, so that ballots rarely fail; safety does not depend on it.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 
 from attrs import evolve, frozen
 
 from laneweave.coordinator.ballots.ballot_round import BallotPhase
 from laneweave.coordinator.planning.rolling.problem import MovingPart, OpenRoad, StreamVehicle
 from laneweave.coordinator.rolling.observed import Snapshot
-from laneweave.coordinator.rolling.ownership import cells_before
+from laneweave.coordinator.rolling.ownership import ReplacedBallots
 from laneweave.coordinator.rolling.transfer import CellTransfer
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.road_layout import (
@@ -32,7 +32,7 @@ from laneweave.protocol.scenario.formation_table import READY_LATE_S
 from laneweave.protocol.vehicle.lane_ends import sections_to_lines
 from laneweave.protocol.vehicle.motion import DISPLACED_ALONG_M
 from laneweave.protocol.vehicle.sudden_stops import queue_pitch_m
-from laneweave.protocol.wire.messages import Ballot, CensusEntry, Name, VehicleState
+from laneweave.protocol.wire.messages import CensusEntry, Name, VehicleState
 
 LOOKAHEAD_M = 600.0
 """Distance before the first moves at which planning for a vehicle begins: the length of S3, so that
@@ -62,22 +62,23 @@ class KnownRoad:
         return self.scenario.timing.cycles_s[0]
 
     def vehicles_and_blocked_cells(
-        self, transfers: Sequence[CellTransfer], temporary: TemporaryParts = NO_PARTS
+        self,
+        transfers: Sequence[CellTransfer],
+        replaced: ReplacedBallots,
+        temporary: TemporaryParts = NO_PARTS,
     ) -> tuple[tuple[StreamVehicle, ...], frozenset[Cell]]:
         """Return the vehicles to plan for, and the cells that no plan may use.
 
         Args:
-            transfers: ballots for the slot before, and for this slot if it is planned again: their
-                vehicles will drop them.
+            transfers: ballots for the slot before.
+            replaced: ballots that vehicles have dropped, or will drop for this plan.
             temporary: parts of lanes that are not open as always.
         """
         snapshot, lattice = self.snapshot, self.scenario.lattice
-        t0_s = self.slot * self._slot_s
-        dropped = frozenset(each.ballot for each in transfers if each.t0_s > t0_s - 1e-6)
         vehicles: dict[Cell, StreamVehicle] = {}
         owned, reserved = set[Cell](), set[Cell]()
         far_m = self.scenario.geometry.moves_from_m - LOOKAHEAD_M
-        gated = self._gated([each for each in transfers if each.ballot not in dropped])
+        gated = self._gated(transfers)
         ending = self._ending(temporary.closed)
         # Vehicles without a state come last: they may have moved, and others may hold their cells.
         for entry in sorted(
@@ -88,13 +89,15 @@ class KnownRoad:
             s_m = lattice.cell_s_m(cell[0], (self.slot - 1) * self._slot_s)
             if s_m < far_m:
                 continue
-            late = state is not None and (_is_late(state, dropped) or self._brakes(cell, ending))
-            vehicle = self._vehicle(entry, state, s_m, late=late, gated=entry.vehicle in gated)
+            keeps_cells = state is not None and (
+                _is_late(state, replaced) or self._brakes(cell, ending)
+            )
+            is_gated = entry.vehicle in gated
+            vehicle = self._vehicle(entry, state, s_m, held=keeps_cells, gated=is_gated)
             vehicles.setdefault(cell, vehicle)
             if state is not None:
-                owned |= cells_before(state, snapshot.states, snapshot.gone, dropped)
-                keeps = late or entry.vehicle in gated
-                reserved |= self._reserved(entry, state, keeps_all=keeps)
+                owned |= replaced.cells_before(state, snapshot.states, snapshot.gone)
+                reserved |= self._reserved(entry, state, keeps_all=keeps_cells or is_gated)
         columns = [column for column, _ in vehicles] or [0]
         window = range(min(columns) - MARGIN_COLUMNS, max(columns) + MARGIN_COLUMNS + 1)
         blocked = frozenset(
@@ -159,8 +162,8 @@ class KnownRoad:
     def _brakes(self, cell: Cell, ending: Sequence[tuple[LaneSection, float]]) -> bool:
         """Return whether a vehicle brakes before a closed part when the slot begins.
 
-        Out of its cell it is not ready for a plan, and the gates of all who needed it would stay
-        closed.
+        It can no longer leave its lane. Out of its cell it is not ready for a plan, and the gates
+        of all who needed it would stay closed.
         """
         speed_mps = self.scenario.formation.speed_mps
         braking_m = speed_mps**2 / (2.0 * GENTLE_BRAKING_MPS2)
@@ -169,7 +172,7 @@ class KnownRoad:
         return any(
             cell[1] == section.lane
             and section.from_m <= s_m <= part_m
-            and begins_m + braking_m > section.to_m
+            and begins_m + min(braking_m, speed_mps * self._slot_s) > section.to_m
             for section, part_m in ending
         )
 
@@ -199,7 +202,7 @@ class KnownRoad:
         state: VehicleState | None,
         s_m: float,
         *,
-        late: bool,
+        held: bool,
         gated: bool,
     ) -> StreamVehicle:
         """Return a vehicle as the planner takes it; one without a state is held where it entered.
@@ -208,7 +211,7 @@ class KnownRoad:
             entry: its entry in the census.
             state: its state, if any.
             s_m: position of its cell at the beginning of the slot.
-            late: whether it takes no part in this slot, and keeps its cells.
+            held: whether it stays in its cell, see `_is_late` and `_brakes`.
             gated: whether it takes no part in this slot, see `_gated`.
         """
         targets, own = self._targets(entry, s_m), entry.vehicle_type
@@ -216,7 +219,7 @@ class KnownRoad:
             return StreamVehicle(entry.vehicle, entry.cell, targets, True, vehicle_type=own)
         settles = entry.ready_s > (self.slot - 1) * self._slot_s
         # States from an earlier term of this leader do not report current positions.
-        held = late or not state.attended or state.t_s < self.since_s - 1e-6
+        held = held or not state.attended or state.t_s < self.since_s - 1e-6
         held = held or (self._is_displaced(state) and not settles)
         ready_s = entry.ready_s - READY_LATE_S
         waits = max(int(gated), math.ceil(ready_s / self._slot_s - self.slot - 1e-9))
@@ -281,10 +284,11 @@ class KnownRoad:
         return abs(state.s_m - cell_s_m) > lattice.pitch_m + DISPLACED_ALONG_M
 
 
-def _is_late(state: VehicleState, dropped: Collection[Ballot]) -> bool:
+def _is_late(state: VehicleState, replaced: ReplacedBallots) -> bool:
     """Return whether a vehicle may still begin a move of the slot before: its gate is open.
 
     With a closed gate it never begins once the vehicle promises the newer ballot. The moves of
-    ballots that are dropped are not due yet.
+    replaced ballots are dropped.
     """
-    return state.go and not state.done and not state.moving and state.record.accepted not in dropped
+    waits = state.go and not state.done and not state.moving
+    return waits and (state.record.accepted is None or state.record.accepted not in replaced)

@@ -10,7 +10,7 @@ starts from its cell.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from typing import Any
 
@@ -21,7 +21,7 @@ from laneweave.coordinator.planning.rolling.problem import StreamPlan
 from laneweave.coordinator.rolling.checked_planner import Planner
 from laneweave.coordinator.rolling.known_road import KnownRoad
 from laneweave.coordinator.rolling.observed import ObservedRoad
-from laneweave.coordinator.rolling.ownership import cells_before, partners
+from laneweave.coordinator.rolling.ownership import ReplacedBallots, partners
 from laneweave.coordinator.rolling.transfer import TRANSFER_RULES, CellTransfer
 from laneweave.protocol.lattice import footprint
 from laneweave.protocol.road_layout import NO_PARTS, TemporaryParts
@@ -83,6 +83,10 @@ class RollingOperation:
         self._slot_s = scenario.timing.cycles_s[0]
         self.observed = ObservedRoad()
         self.transfers: list[CellTransfer] = []
+        """Ballots for the newest slot that has been planned."""
+        self._in_progress: list[CellTransfer] = []
+        """Ballots in force for the slot before."""
+        self._replaced = ReplacedBallots()
         self._transfer_of: dict[Name, CellTransfer] = {}
         self._highest: Ballot | None = None
         self._since: tuple[float, float] | None = None
@@ -99,6 +103,7 @@ class RollingOperation:
         """Discard everything: the road is new."""
         self.take_over()
         self.observed.forget()
+        self._replaced = ReplacedBallots()
         self._last_plan, self._newest_slot = None, -1
         self._temporary, self._parts_changed = NO_PARTS, False
 
@@ -108,6 +113,7 @@ class RollingOperation:
         What vehicles have reported about transfers stays true; their positions do not.
         """
         self.transfers.clear()
+        self._in_progress.clear()
         self._transfer_of.clear()
         self.observed.take_over()
         self._ordered = self._since = None
@@ -126,15 +132,13 @@ class RollingOperation:
             return None
         if state.record.promised is not None:
             self._highest = max(self._highest or state.record.promised, state.record.promised)
+        self._replaced.on_state(state)
         transfer = self._transfer_of.get(state.vehicle)
         if transfer is None or not transfer.unfinished:
             return None
         transfer.on_state(state, self.observed.states, now_s)
-        waiting = [each for each in self.transfers if each.dropped and each.unfinished]
-        for each in waiting:
-            each.plan_from_promises(self.observed.states, now_s)
-        changed = [transfer, *(each for each in waiting if each is not transfer)]
-        aborted = [_aborted(each) for each in changed if each.phase is BallotPhase.ABORTED]
+        planned = [transfer, *self._plan_those_that_waited(now_s)]
+        aborted = [_aborted(each) for each in planned if each.phase is BallotPhase.ABORTED]
         if aborted:
             return aborted
         if transfer.phase is BallotPhase.IN_FORCE and self.in_force == 1:
@@ -143,24 +147,35 @@ class RollingOperation:
             return [LogEntry(PLAN_IN_FORCE, {"slot": slot, "closed_s": begun_s + SNAPSHOT_S})]
         return []
 
+    def _plan_those_that_waited(self, now_s: float) -> list[CellTransfer]:
+        """Plan the ballots that need no more promises of others; return them."""
+        waited = [each for each in self.transfers if each.awaits_replaced and each.unfinished]
+        for each in waited:
+            each.plan_from_promises(self.observed.states, now_s)
+        return waited
+
     def lead(
         self, census: Census, t_s: float, now_s: float, *, changed: bool
     ) -> Iterator[Effect | LogEntry]:
         """Request the plan for the next slot when it is due; send messages."""
         if changed:
-            yield from self.on_census(census)
+            yield from self.on_census(census, now_s)
             yield from self.order(t_s, now_s)
         for vehicle, message in self.outgoing(now_s):
             yield to_vehicle(vehicle, message)
 
-    def on_census(self, census: Census) -> list[LogEntry]:
+    def on_census(self, census: Census, now_s: float = 0.0) -> list[LogEntry]:
         """Update the vehicles on the road."""
         aborted = []
         for name in self.observed.on_census(census):
             transfer = self._transfer_of.pop(name, None)
             if transfer is not None and transfer.on_left(name):
                 aborted.append(_aborted(transfer))
-        return aborted
+        gone = self.observed.gone
+        for each in self.transfers:
+            each.gone = gone
+        waited = self._plan_those_that_waited(now_s)
+        return aborted + [_aborted(each) for each in waited if each.phase is BallotPhase.ABORTED]
 
     def _abort(self, transfers: Iterable[CellTransfer], reason: str) -> Iterator[LogEntry]:
         """Abort those of the ballots that are not decided."""
@@ -196,7 +211,11 @@ class RollingOperation:
             self._scenario, self.observed.at(snapshot_s), snapshot_s, slot + 1, self._since[0]
         )
         self._parts_changed = False
-        vehicles, blocked = known.vehicles_and_blocked_cells(self.transfers, self._temporary)
+        replaced = self._replaced.copy()
+        for each in self._for_slot(slot + 1):
+            replaced.replace(each.ballot, each.roster, self.observed.states)
+        before = [*self._in_progress, *self._for_slot(slot)]
+        vehicles, blocked = known.vehicles_and_blocked_cells(before, replaced, self._temporary)
         self._newest_slot = slot + 1
         job = self._new_job()
         self._ordered = (job, slot + 1)
@@ -217,22 +236,38 @@ class RollingOperation:
         slot = self._ordered[1]
         self._ordered = None
         t0_s = slot * self._slot_s
-        replaced = [each for each in self.transfers if each.t0_s > t0_s - 1e-6]
-        yield from self._abort(self.transfers, "the next slot is planned")
-        plan = computed.result
+        replaced, plan = self._for_slot(slot), computed.result
+        # Moves of replaced ballots must not have begun.
+        late = t_s > (t0_s if replaced else t0_s + MAX_DELAY_S)
+        if not (replaced and late):
+            yield from self._abort(self.transfers, "the next slot is planned")
         if not isinstance(plan, StreamPlan):
             yield LogEntry(PLANNING_FAILED, {"slot": slot, "error": computed.error})
             return
         known = set() if self._last_plan is None else {*self._last_plan.missed}
         self._last_plan = plan
-        # Moves of replaced ballots must not have begun.
-        if t_s > (t0_s if replaced else t0_s + MAX_DELAY_S):
+        if late:
             yield LogEntry(PLANNING_LATE, {"slot": slot})
             return
+        self._in_progress = [
+            each
+            for each in (*self._in_progress, *self._for_slot(slot - 1))
+            if each.t0_s > t0_s - 1.5 * self._slot_s
+        ]
+        self._replaced.forget(self.observed.states)
         self.transfers = [*self._make_transfers(plan, t0_s, now_s, replaced)]
         self._transfer_of = {name: each for each in self.transfers for name in each.roster}
         out_of_reach = [name for name in plan.missed if name not in known]
         yield LogEntry(STREAM_PLANNED, self._log_data(plan) | {"out_of_reach": out_of_reach})
+
+    def _for_slot(self, slot: int) -> list[CellTransfer]:
+        """Return the newest ballots for a slot whose plans vehicles may have accepted."""
+        return [
+            each
+            for each in self.transfers
+            if abs(each.t0_s - slot * self._slot_s) < 1e-6
+            and each.phase in (BallotPhase.ISSUING, BallotPhase.IN_FORCE)
+        ]
 
     def _log_data(self, plan: StreamPlan) -> dict[str, Any]:
         sizes = [len(transfer.roster) for transfer in self.transfers]
@@ -260,11 +295,12 @@ class RollingOperation:
                 promise a newer one; a ballot with the same vehicles and moves is kept instead.
         """
         states, gone = self.observed.states, self.observed.gone
-        dropped = frozenset(each.ballot for each in replaced)
+        for each in replaced:
+            self._replaced.replace(each.ballot, each.roster, states)
         owner = {
             cell: name
             for name, state in states.items()
-            for cell in cells_before(state, states, gone, dropped)
+            for cell in self._replaced.cells_before(state, states, gone)
         }
         moves: dict[Name, Move] = {}
         rosters: dict[Name, set[Name]] = {}
@@ -278,27 +314,27 @@ class RollingOperation:
             cells = footprint(path[0], path[1])
             if all(cell in owner for cell in cells):
                 moves[name] = (path[0], path[1])
-                owners = {owner[cell] for cell in cells} | {name}
-                rosters[name] = self._with_partners(owners, dropped)
+                rosters[name] = self._with_partners({owner[cell] for cell in cells} | {name})
         same = {
             each.roster: each
             for each in replaced
             if each.phase is BallotPhase.IN_FORCE
             and each.moves == {name: moves[name] for name in each.roster if name in moves}
         }
+        # Others promise one by one: one that is not ready must not keep the others waiting.
         earlier = [{*roster} for roster in same]
         earlier += [{name} for each in replaced if each.roster not in same for name in each.roster]
-        clusters = _clusters([*rosters.values(), *(each & states.keys() for each in earlier)])
-        for members in clusters:
+        for members in _clusters([*rosters.values(), *(each & states.keys() for each in earlier)]):
             roster = tuple(sorted(members))
             if roster in same:
+                self._replaced.keep(same[roster].ballot)
                 yield same[roster]
                 continue
             yield CellTransfer(
                 ballot=self._new_ballot(self._highest),
                 roster=roster,
                 moves={name: moves[name] for name in roster if name in moves},
-                dropped=dropped,
+                replaced=self._replaced,
                 t0_s=t0_s,
                 slot_s=self._slot_s,
                 resend_s=self._scenario.network.resend_s,
@@ -307,15 +343,15 @@ class RollingOperation:
                 rules=self._rules,
             )
 
-    def _with_partners(self, names: set[Name], dropped: Collection[Ballot]) -> set[Name]:
+    def _with_partners(self, names: set[Name]) -> set[Name]:
         """Add the vehicles whose promises determine what the others own.
 
-        The members of ballots that are dropped promise new ones in any case.
+        The members of replaced ballots promise newer ones in any case.
         """
         roster, waiting, states = set(names), sorted(names), self.observed.states
         while waiting:
             state = states[waiting.pop()]
-            if state.record.transfer is not None and state.record.transfer.ballot in dropped:
+            if state.record.transfer is not None and state.record.transfer.ballot in self._replaced:
                 continue
             new = partners(state, states) - roster
             roster |= new

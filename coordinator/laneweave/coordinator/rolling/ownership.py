@@ -10,6 +10,8 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from enum import Enum
 
+from attrs import define, field
+
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.wire.messages import Ballot, Name, PendingTransfer, VehicleState
 
@@ -59,21 +61,6 @@ def certain_cells(
     return frozenset(transfer.before) & frozenset(transfer.after)
 
 
-def cells_before(
-    state: VehicleState, states: States, gone: Collection[Name], dropped: Collection[Ballot]
-) -> frozenset[Cell]:
-    """Return the cells that a vehicle owns for certain if ballots are dropped.
-
-    All members of these ballots will promise a higher one. Until their gates are known to be open,
-    the vehicle is expected to own the cells `before`.
-    """
-    transfer = state.record.transfer
-    if transfer is not None and transfer.ballot in dropped:
-        owned = owned_cells(state, states, gone)
-        return frozenset(transfer.before) if owned is None else owned
-    return certain_cells(state, states, gone)
-
-
 def partners(state: VehicleState, states: States) -> frozenset[Name]:
     """Return the vehicles whose promises determine what a vehicle owns; none if that is known."""
     transfer = state.record.transfer
@@ -83,6 +70,79 @@ def partners(state: VehicleState, states: States) -> frozenset[Name]:
     if _Sign.OPEN in signs or _Sign.NEVER_READY in signs or signs == {_Sign.CLOSED}:
         return frozenset()
     return frozenset(name for name in transfer.roster if name in states)
+
+
+@define
+class ReplacedBallots:
+    """Ballots whose vehicles drop their moves, and what these have shown about the start gates.
+
+    The members promise higher ballots one by one. What one has shown stays true when it has a newer
+    transfer, so it is kept as long as any vehicle stores a transfer of the ballot.
+    """
+
+    _shown: dict[Ballot, dict[Name, VehicleState]] = field(factory=dict)
+    """States with evidence about a start gate, by ballot and member."""
+    _members: dict[Ballot, tuple[Name, ...]] = field(factory=dict)
+
+    def __contains__(self, ballot: Ballot) -> bool:
+        """Return whether a ballot is one of them."""
+        return ballot in self._members
+
+    def __bool__(self) -> bool:
+        """Return whether there are any."""
+        return bool(self._members)
+
+    def copy(self) -> ReplacedBallots:
+        """Return an independent copy."""
+        shown = {ballot: dict(states) for ballot, states in self._shown.items()}
+        return ReplacedBallots(shown, dict(self._members))
+
+    def replace(self, ballot: Ballot, members: tuple[Name, ...], states: States) -> None:
+        """Add a ballot, with the newest states of all vehicles."""
+        self._members[ballot], self._shown[ballot] = members, {}
+        for name in members:
+            if name in states:
+                self.on_state(states[name])
+
+    def keep(self, ballot: Ballot) -> None:
+        """Remove a ballot, which stays in force."""
+        del self._members[ballot], self._shown[ballot]
+
+    def on_state(self, state: VehicleState) -> None:
+        """Note what a newer state of a vehicle shows."""
+        for ballot, members in self._members.items():
+            if state.vehicle in members and _sign(state, ballot) in _LASTING:
+                self._shown[ballot].setdefault(state.vehicle, state)
+
+    def forget(self, states: States) -> None:
+        """Forget the ballots of which no vehicle stores a transfer."""
+        stored = {each.record.transfer.ballot for each in states.values() if each.record.transfer}
+        for ballot in [each for each in self._members if each not in stored]:
+            del self._members[ballot], self._shown[ballot]
+
+    def owned_cells(
+        self, state: VehicleState, states: States, gone: Collection[Name] = ()
+    ) -> frozenset[Cell] | None:
+        """Return the cells that a vehicle owns; None: not known yet. See `owned_cells`."""
+        transfer = state.record.transfer
+        if transfer is None or transfer.ballot not in self:
+            return owned_cells(state, states, gone)
+        shown = self._shown[transfer.ballot]
+        left = [name for name in gone if name not in shown]
+        return owned_cells(state, {**states, **shown}, left)
+
+    def cells_before(
+        self, state: VehicleState, states: States, gone: Collection[Name]
+    ) -> frozenset[Cell]:
+        """Return the cells that a vehicle owns for certain once all have promised higher ballots.
+
+        Of a replaced ballot these are the cells `before`, unless its gate is known to be open.
+        """
+        transfer = state.record.transfer
+        if transfer is None or transfer.ballot not in self:
+            return certain_cells(state, states, gone)
+        owned = self.owned_cells(state, states, gone)
+        return frozenset(transfer.before) if owned is None else owned
 
 
 class _Sign(Enum):
@@ -96,33 +156,33 @@ class _Sign(Enum):
     NONE = "no evidence"
 
 
+_LASTING = (_Sign.OPEN, _Sign.CLOSED, _Sign.NEVER_READY)
+"""Evidence that a newer transfer of the vehicle hides."""
+
+
 def _signs(
     state: VehicleState, transfer: PendingTransfer, states: States, gone: Collection[Name]
 ) -> set[_Sign]:
     others = [name for name in transfer.roster if name != state.vehicle]
-    signs = {_sign(states.get(name), transfer) for name in others if name not in gone}
+    signs = {_sign(states.get(name), transfer.ballot) for name in others if name not in gone}
     if any(name in gone for name in others):
         signs.add(_Sign.GONE)
-    return signs | {_sign(state, transfer)}
+    return signs | {_sign(state, transfer.ballot)}
 
 
-def _sign(state: VehicleState | None, transfer: PendingTransfer) -> _Sign:
+def _sign(state: VehicleState | None, ballot: Ballot) -> _Sign:
     if state is None:
         return _Sign.NONE
     theirs = state.record.transfer
-    if theirs is not None and theirs.ballot > transfer.ballot:
+    if theirs is not None and theirs.ballot > ballot:
         return _Sign.NEWER
-    if theirs is not None and theirs.withdrawn and theirs.ballot == transfer.ballot:
+    if theirs is not None and theirs.withdrawn and theirs.ballot == ballot:
         return _Sign.GONE
-    if theirs is not None and theirs.ballot < transfer.ballot:
+    if theirs is not None and theirs.ballot < ballot:
         theirs = None  # of an earlier plan
     if theirs is not None and theirs.open:
         return _Sign.OPEN
-    if (
-        state.record.promised is None
-        or state.record.promised <= transfer.ballot
-        or not state.record.owned
-    ):
+    if state.record.promised is None or state.record.promised <= ballot or not state.record.owned:
         return _Sign.NONE
     if theirs is None:
         return _Sign.NEVER_READY  # it has not accepted the plan

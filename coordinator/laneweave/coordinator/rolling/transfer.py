@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from attrs import define, field
+from attrs import define, evolve, field
 from msgspec.structs import replace
 
 from laneweave.coordinator.ballots.ballot_round import (
@@ -31,7 +31,7 @@ from laneweave.coordinator.ballots.ballot_round import (
     restarted,
 )
 from laneweave.coordinator.planning.conflict_kinds import Move
-from laneweave.coordinator.rolling.ownership import States, owned_cells
+from laneweave.coordinator.rolling.ownership import ReplacedBallots, States
 from laneweave.protocol.lattice import Cell, PlannedMove, footprint
 from laneweave.protocol.names import first_names
 from laneweave.protocol.state_machine import RuleBook, Transition
@@ -54,11 +54,13 @@ class CellTransfer(BallotRound):
     t0_s: float
     """Road time at which the moves begin."""
     slot_s: float
-    dropped: frozenset[Ballot] = frozenset()
-    """Earlier ballots for the slot, whose members all promise new ones. The plan waits until it is
-    known which cells they own then."""
+    replaced: ReplacedBallots = field(factory=ReplacedBallots)
+    """Ballots whose members all promise newer ones."""
+    awaits_replaced: bool = False
+    """Whether all have promised, and members of replaced ballots in other rosters have not, so that
+    the owners of some cells are not known yet."""
     gone: frozenset[Name] = frozenset()
-    """Departed vehicles that are in rosters of pending transfers."""
+    """Departed vehicles that are in rosters of pending transfers; changes with the census."""
     reason: str = ""
     """Why the ballot was aborted."""
     unanswered: tuple[Name, ...] = ()
@@ -75,18 +77,21 @@ class CellTransfer(BallotRound):
         self.plan_from_promises(states, now_s)
 
     def plan_from_promises(self, states: States, now_s: float) -> None:
-        """Plan if all have promised, and what they own no longer depends on dropped ballots."""
-        if not self._waits(states) and self.take(PROMISED, now_s):
+        """Plan if all have promised, and what they own does not depend on others' promises."""
+        self.awaits_replaced = self._awaits_replaced(states)
+        if self.take(PROMISED, now_s):
             plan = self._make_plan(states)
             self.take(PLANNED if isinstance(plan, Plan) else FAILED, now_s, plan)
 
-    def _waits(self, states: States) -> bool:
-        """Return whether a dropped ballot does not show yet who owns its cells."""
-        known = dict(states) | self.promises if self.dropped else {}
+    def _awaits_replaced(self, states: States) -> bool:
+        preparing = self.phase is BallotPhase.PREPARING
+        if not (preparing and self.replaced and len(self.promises) == len(self.roster)):
+            return False
+        known = dict(states) | self.promises
         return any(
             promise.record.transfer is not None
-            and promise.record.transfer.ballot in self.dropped
-            and owned_cells(promise, known, self.gone) is None
+            and promise.record.transfer.ballot in self.replaced
+            and self.replaced.owned_cells(promise, known, self.gone) is None
             for promise in self.promises.values()
         )
 
@@ -101,8 +106,9 @@ class CellTransfer(BallotRound):
     def _make_plan(self, states: States) -> Plan | str:
         """Return the plan from the promises, or the reason why there is none."""
         before: dict[Name, frozenset[Cell]] = {}
+        known = dict(states) | self.promises
         for name, promise in self.promises.items():
-            owned = owned_cells(promise, dict(states) | self.promises, self.gone)
+            owned = self.replaced.owned_cells(promise, known, self.gone)
             if owned is None:
                 return f"the cells of {name} are not known"
             before[name] = owned
@@ -135,6 +141,11 @@ def reports_owned_cells(_: CellTransfer, state: VehicleState) -> bool:
     return bool(state.record.owned)
 
 
+def knows_owners(transfer: CellTransfer, _: object) -> bool:
+    """What the members own does not depend on promises of other members of replaced ballots."""
+    return not transfer.awaits_replaced
+
+
 def record_outbid(transfer: CellTransfer, _: object) -> None:
     """Record the reason; wait for the next slot."""
     transfer.reason = "outbid"
@@ -155,7 +166,6 @@ def record_unanswered(transfer: CellTransfer, reason: str) -> None:
     issuing = transfer.phase is BallotPhase.ISSUING
     answers = transfer.accepted if issuing else transfer.promises
     transfer.unanswered = tuple(name for name in transfer.roster if name not in answers)
-    # All may have promised, while members of replaced ballots have not (`_waits`).
     awaited = first_names(transfer.unanswered, MAX_NAMED) or "a member of a replaced ballot"
     transfer.reason = f"{reason}, and {awaited} did not answer"
 
@@ -163,12 +173,15 @@ def record_unanswered(transfer: CellTransfer, reason: str) -> None:
 _PREPARING, _PLANNING, _ISSUING = UNFINISHED
 _WAITING, _ABORTED = (_PREPARING, _ISSUING), BallotPhase.ABORTED
 
+_WHEN_PROMISED, *_MORE_PLAN_RULES = PLAN_RULES
+
 TRANSFER_RULES: RuleBook = RuleBook(
     (
         Transition("L7", STATE, _WAITING, (has_higher_promise,), (record_outbid,), _ABORTED),
         Transition("L8", STATE, _WAITING, (had_promised, restarted), (record_restart,), _ABORTED),
         Transition("L4", STATE, (_PREPARING,), (is_promise, reports_owned_cells), (count_promise,)),
-        *PLAN_RULES,
+        evolve(_WHEN_PROMISED, guards=(*_WHEN_PROMISED.guards, knows_owners)),
+        *_MORE_PLAN_RULES,
         Transition("L5", FAILED, (_PLANNING,), (), (record_reason,), _ABORTED),
         Transition("L8", MEMBERS, _WAITING, (), (record_reason,), _ABORTED),
         Transition("L8", TOO_LATE, _WAITING, (), (record_unanswered,), _ABORTED),

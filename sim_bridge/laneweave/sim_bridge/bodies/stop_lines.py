@@ -31,8 +31,8 @@ class StopLinesAhead:
     lane_ends: LaneEnds = Factory(lambda self: LaneEnds(self._scenario), takes_self=True)
     passed: bool = False
     """Whether the vehicle has started from standing at a stop line."""
-    _kept_out: bool = False
-    """See `keep_out`."""
+    _kept_out_of: Cell | None = None
+    """Cell in a lane that has ended, which the body may not enter; see `keep_out`."""
     _past: LaneEnd | None = None
     """Beginning of a part of its lane that is open again: it has started there, and passes it."""
 
@@ -46,8 +46,9 @@ class StopLinesAhead:
     ) -> bool:
         """Return whether the lane of a move has ended before the body has entered it.
 
-        The vehicle drives past in its own lane, in which nobody is led into its cell, until nobody
-        in the other lane slows down ahead of it: the closed part grows while a vehicle breaks down.
+        The vehicle drives past in its own lane, and the cells of its move stay its own. A closed
+        part grows while a vehicle breaks down: beyond it, slower vehicles ahead in the other lane
+        keep the vehicle out, too.
 
         Args:
             hold_cell: cell that the vehicle holds or moves to.
@@ -56,16 +57,13 @@ class StopLinesAhead:
             ahead: measured neighbours ahead.
             speed_mps: speed of the vehicle.
         """
-        goal = hold_cell[1]
-        if body_lane == goal:
-            self._kept_out = False
-        elif self.lane_ends.has_passed(hold_cell, t_s):
-            self._kept_out = True
-        elif self._kept_out:
-            self._kept_out = any(
-                one.lane == goal and one.speed_mps < speed_mps - SLOWER_MPS for one in ahead
+        ended = body_lane != hold_cell[1] and self.lane_ends.has_passed(hold_cell, t_s)
+        if not ended and hold_cell == self._kept_out_of:
+            ended = body_lane != hold_cell[1] and any(
+                one.lane == hold_cell[1] and one.speed_mps < speed_mps - SLOWER_MPS for one in ahead
             )
-        return self._kept_out
+        self._kept_out_of = hold_cell if ended else None
+        return ended
 
     def start(self, goal: int, lane: int, s_m: float) -> None:
         """Start from standing towards a lane, from a position in another or the same one."""

@@ -253,10 +253,12 @@ class LaneEndControl:
             t_s: road time.
             ahead_m: front of the vehicle that gets the gap before; -inf: there is none.
         """
-        arrives_s = self._gap_arrives_s(at, vehicle)
+        arrives_s = self._gap_arrives_s(at[0], vehicle)
         own = self._starts_in_own_lane(at, vehicle, arrives_s)
         lane = at[0] if own else self._beside(at, vehicle, arrives_s)
-        if lane is None:
+        if lane is None or (
+            not own and lane != self._beside(at, vehicle, self._gap_arrives_s(lane, vehicle))
+        ):
             return  # SUMO takes the vehicle back, or it waits until a lane is open
         # Behind the first entry point of the lane, vehicles may own its cells.
         point = lane
@@ -297,9 +299,9 @@ class LaneEndControl:
             return max_columns
         return max(min_columns, math.ceil(gap_cells / spare_cells) - columns)
 
-    def _gap_arrives_s(self, at: LanePosition, vehicle: RoadVehicle) -> float:
-        """Return the road time at which the next gap in the lane of a vehicle would pass it."""
-        return self._lattice.passing_time_s(self._meter.next_column(at[0]), vehicle.state[0])
+    def _gap_arrives_s(self, lane: int, vehicle: RoadVehicle) -> float:
+        """Return the road time at which the next gap of a lane would begin to pass a vehicle."""
+        return self._lattice.passing_time_s(self._meter.next_column(lane), vehicle.state[0])
 
     def _is_open(self, at: LanePosition, vehicle: RoadVehicle, at_s: float) -> bool:
         """Return whether a vehicle can drive on in its lane at a road time, beyond a dead end.
@@ -355,9 +357,9 @@ class LaneEndControl:
         return vehicle.state[0] <= self._ends[at].line_m + NEAR_LINE_M
 
     def _may_start(self, at: LanePosition, vehicle: RoadVehicle, at_s: float) -> bool:
-        """Return whether a vehicle drives at a road time, and has room to start where it waits.
+        """Return whether a vehicle may start at a road time, and has room to, where it waits.
 
-        One that has broken down blocks its own lane, from where it stands, until it is repaired.
+        One that has broken down may start in its own lane once it is repaired.
         """
         breaks_down = vehicle.controller.broken_mps2 is not None
         if breaks_down and vehicle.state[1] > STANDING_MPS:
@@ -372,7 +374,7 @@ class LaneEndControl:
 
         So those that wait for a part whose end is known get gaps that arrive soon after it.
         """
-        return self._may_start(at, vehicle, self._gap_arrives_s(at, vehicle))
+        return self._may_start(at, vehicle, self._gap_arrives_s(at[0], vehicle))
 
     def _may_take(self, gap: Gap, at: LanePosition, vehicle: RoadVehicle, at_s: float) -> bool:
         """Return whether a vehicle can start into a gap at a road time from where it waits."""

@@ -213,8 +213,13 @@ def test_a_slot_that_begins_soon_is_not_planned_again() -> None:
     assert len(call.now.sections) == 4
 
 
-def planned_again(desk: Bench, *ways: dict[str, tuple[Cell, ...]]) -> CellTransfer:
-    """Plan twice, the second time with a part closed; return the ballot in force before."""
+def in_force_when_a_part_is_closed(
+    desk: Bench, ways: dict[str, tuple[Cell, ...]] | None = None
+) -> CellTransfer:
+    """Put a ballot of A and B into force, and close a part; return the ballot.
+
+    `ways`: what the planner finds from now on, if it is something else.
+    """
     desk.think()
     earlier = desk.transfer
     plan = run_ballot(desk)
@@ -231,21 +236,21 @@ def planned_again(desk: Bench, *ways: dict[str, tuple[Cell, ...]]) -> CellTransf
         )
     )
     assert earlier.phase is BallotPhase.IN_FORCE
-    desk.ways = ways[0] if ways else desk.ways
+    desk.ways = desk.ways if ways is None else ways
     desk.control.on_obstacles(TemporaryParts((PART._replace(lane=2),)))
     return earlier
 
 
 def test_a_ballot_with_the_same_moves_is_kept_when_a_slot_is_planned_again() -> None:
     desk = bench(A, B, ways={A: ((0, 0), (0, 1))})
-    earlier = planned_again(desk)
+    earlier = in_force_when_a_part_is_closed(desk)
     desk.think(LOOK_S + 1.0)
     assert desk.control.transfers == [earlier]
 
 
 def test_a_ballot_with_other_moves_is_replaced_when_a_slot_is_planned_again() -> None:
     desk = bench(A, B, ways={A: ((0, 0), (0, 1))})
-    earlier = planned_again(desk, {})
+    earlier = in_force_when_a_part_is_closed(desk, {})
     call = desk.call(LOOK_S + 1.0)
     assert not any(one.held or one.waits for one in call.vehicles.values())
     assert (0, 1) not in call.blocked
@@ -258,20 +263,52 @@ def test_a_ballot_with_other_moves_is_replaced_when_a_slot_is_planned_again() ->
     assert [one.roster for one in desk.control.transfers] == [(A,), (B,)]
 
 
-@pytest.mark.parametrize(("from_m", "brakes"), [(800.0, False), (640.0, True), (500.0, True)])
-def test_one_that_brakes_before_a_closed_part_keeps_its_cells(from_m: float, brakes: bool) -> None:
-    """B is at 487 m, and at 570 m when the slot begins; the stop line is 60 m before the part."""
+@pytest.mark.parametrize(
+    ("line_m", "brakes"), [(570.0 + 57.0, False), (570.0 + 55.0, True), (500.0, True)]
+)
+def test_one_that_brakes_before_a_closed_part_keeps_its_cells(
+    line_m: float, *, brakes: bool
+) -> None:
+    """B is at 570 m when the slot begins; its gentle braking distance is 56 m."""
     desk = bench(A, B)
-    desk.control.on_obstacles(TemporaryParts((TemporaryClosure(1, from_m, from_m + 50.0),)))
+    queue_m = ROLLING.types.longest_body_m + ROLLING.tracking.min_gap_m
+    from_m = line_m + queue_m + re_entry(ROLLING).room_m
+    part = TemporaryClosure(1, from_m, from_m + 50.0)
+    desk.control.on_obstacles(TemporaryParts((part,)))
     call = desk.call()
+    assert call.now is not None
     assert call.vehicles[B].held == brakes
     assert not call.vehicles[A].held
     assert ({*OWNED[B]} - {HOMES[B]} <= call.blocked) == brakes
 
 
+def test_a_slot_may_be_planned_a_third_time() -> None:
+    """The transfers that vehicles store are then those of the ballot before the last."""
+    desk = bench(A, B, ways={A: ((0, 0), (0, 1))})
+    earlier = in_force_when_a_part_is_closed(desk, {A: ((0, 0), (1, 0))})
+    desk.think(LOOK_S + 1.0)
+    desk.control.on_obstacles(TemporaryParts((PART._replace(lane=2, from_m=590.0),)))
+    call = desk.call(LOOK_S + 2.0)
+    assert not any(one.held or one.waits for one in call.vehicles.values())
+    assert (0, 1) not in call.blocked
+    assert all(earlier.ballot in one.replaced for one in desk.control.transfers)
+
+
+def test_a_plan_does_not_wait_for_a_member_of_a_replaced_ballot_that_leaves_the_lattice() -> None:
+    desk = bench(A, B, ways={A: ((0, 0), (0, 1))})
+    earlier = in_force_when_a_part_is_closed(desk, {A: ((0, 0), (1, 0))})
+    desk.think(LOOK_S + 1.0)
+    transfer = desk.control.transfers[0]
+    pending = PendingTransfer(earlier.ballot, OWNED[A], OWNED[A], (A, B))
+    desk.hear(changed(shown(A, transfer.ballot, pending), t_s=BEGUN_S + 2.0))
+    assert transfer.plan is None
+    desk.control.on_census(replace(census(A), t_s=BEGUN_S + 2.0))
+    assert transfer.plan is not None
+
+
 def test_nothing_is_replaced_once_the_slot_has_begun() -> None:
     desk = bench(A, B, ways={A: ((0, 0), (0, 1))})
-    earlier = planned_again(desk, {})
+    earlier = in_force_when_a_part_is_closed(desk, {})
     compute = desk.order(LOOK_S + 1.0)
     assert compute is not None
     (note,) = desk.finish(compute, BEGUN_S + SLOT_S + 0.1)
@@ -281,12 +318,12 @@ def test_nothing_is_replaced_once_the_slot_has_begun() -> None:
 
 def test_a_new_plan_waits_until_it_is_known_who_owns_the_cells_of_a_replaced_ballot() -> None:
     desk = bench(A, B, ways={A: ((0, 0), (0, 1))})
-    earlier = planned_again(desk, {A: ((0, 0), (1, 0))})
+    earlier = in_force_when_a_part_is_closed(desk, {A: ((0, 0), (1, 0))})
     desk.think(LOOK_S + 1.0)
     ballot_of = {one.roster: one.ballot for one in desk.control.transfers}
     transfer = desk.control.transfers[0]
     assert transfer.roster == (A,)
-    assert transfer.dropped == {earlier.ballot}
+    assert earlier.ballot in transfer.replaced
     for name in (A, B):
         assert transfer.phase is BallotPhase.PREPARING
         before, after = (OWNED[name], (HOMES[name],))
@@ -501,9 +538,13 @@ def test_members_of_a_ballot_whose_gate_is_closed_take_part_in_no_other() -> Non
         return desk.call(t_s + SNAPSHOT_S + 0.1)
 
     call = next_call(1, go=False)
-    assert call.vehicles[A].waits == 1
-    assert {(1, 0), (-1, 0)} <= call.blocked
-    assert call.vehicles[B].waits == 0
+    desk.control.on_obstacles(TemporaryParts((PART._replace(lane=2),)))
+    again = desk.call(BEGUN_S + SLOT_S + SNAPSHOT_S + 1.0)
+    assert again.slot == call.slot
+    for each in (call, again):
+        assert each.vehicles[A].waits == 1
+        assert {(1, 0), (-1, 0)} <= each.blocked
+        assert each.vehicles[B].waits == 0
     later = next_call(2, go=False)
     assert later.vehicles[A].waits == 0
 

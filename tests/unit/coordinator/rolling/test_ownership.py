@@ -5,7 +5,12 @@ from __future__ import annotations
 import pytest
 from msgspec.structs import replace
 
-from laneweave.coordinator.rolling.ownership import certain_cells, owned_cells, partners
+from laneweave.coordinator.rolling.ownership import (
+    ReplacedBallots,
+    certain_cells,
+    owned_cells,
+    partners,
+)
 from laneweave.protocol.wire.messages import Ballot, Name, PendingTransfer, VehicleState
 from support.rolling_samples import AFTER, BEFORE, HIGH, LOW, MID, A, B, C, pending, state
 from support.states import changed
@@ -136,3 +141,41 @@ def test_a_vehicle_that_has_entered_again_owns_what_the_roadside_has_assigned() 
     again = state(C, HIGH, PendingTransfer(HIGH), owned=cells)
     assert owned_cells(again, {}) == certain_cells(again, {}) == set(cells)
     assert partners(again, {}) == frozenset()
+
+
+CLOSED_B, CLOSED_C = state(B, BETWEEN, TRANSFER_OF_B), state(C, HIGH, TRANSFER_OF_C)
+MOVED_ON = state(B, HIGH, PendingTransfer(HIGH, open=True))
+"""B has a newer transfer, which hides what it has shown before."""
+
+
+@pytest.mark.parametrize("in_time", [True, False])
+def test_what_members_of_a_replaced_ballot_have_shown_stays_true(*, in_time: bool) -> None:
+    replaced = ReplacedBallots()
+    replaced.replace(MID, (A, B, C), {B: CLOSED_B} if in_time else {})
+    replaced.on_state(MOVED_ON)
+    replaced.on_state(CLOSED_C)
+    states = {A: CLOSED, B: MOVED_ON}
+    assert owned_cells(CLOSED, states, {C}) == SURE
+    assert replaced.owned_cells(CLOSED, states, {C}) == (OWNED_BEFORE if in_time else SURE)
+    assert replaced.copy().owned_cells(CLOSED, states, {C}) == (OWNED_BEFORE if in_time else SURE)
+
+
+def test_a_gate_of_a_replaced_ballot_that_is_known_to_be_open_counts() -> None:
+    replaced = ReplacedBallots()
+    replaced.replace(MID, (A, B, C), {})
+    waiting = state(A, MID, TRANSFER)
+    assert replaced.owned_cells(waiting, {}) is None
+    assert replaced.cells_before(waiting, {}, ()) == OWNED_BEFORE
+    replaced.on_state(state(C, MID, OPEN))
+    assert replaced.cells_before(waiting, {C: state(C, HIGH)}, ()) == OWNED_AFTER
+
+
+def test_replaced_ballots_are_forgotten_when_no_vehicle_stores_their_transfer() -> None:
+    replaced = ReplacedBallots()
+    replaced.replace(MID, (A, B, C), {})
+    replaced.forget({A: CLOSED, B: MOVED_ON})
+    assert MID in replaced
+    replaced.forget({B: MOVED_ON})
+    assert MID not in replaced
+    assert not replaced
+    assert replaced.owned_cells(CLOSED, {}, {B, C}) == owned_cells(CLOSED, {}, {B, C})

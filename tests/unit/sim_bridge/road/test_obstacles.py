@@ -11,7 +11,7 @@ from attrs import evolve
 
 from laneweave.protocol.road_layout import TemporaryClosure, TemporaryParts
 from laneweave.protocol.scenario.road_tables import Closure, Demand, RoadEvent
-from laneweave.protocol.vehicle.lane_ends import LaneEnds, re_entry
+from laneweave.protocol.vehicle.lane_ends import START_S, LaneEnds, re_entry
 from laneweave.protocol.vehicle.sudden_stops import room_before_part_m
 from laneweave.protocol.wire.events import (
     DRIVES_OUT,
@@ -134,11 +134,12 @@ def check_that_a_gap_passes_when_it_is_repaired() -> None:
     while vehicle.controller.off_lattice is OffLatticePhase.WAITING:
         road.step()
         passes_s += [
-            ROAD.lattice.passing_time_s(gap.columns[0], vehicle.state[0])
+            ROAD.lattice.passing_time_s(gap.columns[-1], vehicle.state[0])
             for gap in gaps_of(road).get(LANE, [])
         ]
-    assert min(passes_s) >= repaired_s
-    assert road.t_s <= repaired_s + re_entry(ROAD).columns + 2.0
+    gap_s = re_entry(ROAD).columns * ROAD.lattice.pitch_m / ROAD.lattice.speed_mps
+    assert repaired_s <= min(passes_s) <= repaired_s + gap_s
+    assert repaired_s <= road.t_s <= repaired_s + gap_s + START_S
 
 
 def test_no_gap_is_kept_free_for_a_vehicle_that_is_never_repaired() -> None:
