@@ -16,7 +16,7 @@ from laneweave.coordinator.formations import operation
 from laneweave.coordinator.formations.leader import FormationLeader
 from laneweave.coordinator.formations.roster import Formation, Groups
 from laneweave.coordinator.formations.stages import Stage
-from laneweave.coordinator.rolling import transfer
+from laneweave.coordinator.rolling import ownership, transfer
 from laneweave.coordinator.rolling.ownership import States
 from laneweave.coordinator.rolling.transfer import CellTransfer
 from laneweave.launch.fault_search.road.drawn_entrance import DrawnBlocks
@@ -447,12 +447,12 @@ def show_owned_cells_at_once(
     return state(self, changed(sense, promised=self.promised), **more)
 
 
-@instead_of(transfer, "owned_cells")
+@instead_of(ownership, "owned_cells")
 def cancel_closed_transfers(_: object, state: VehicleState, *__: object) -> frozenset[Cell]:
     return frozenset(state.record.owned)
 
 
-@instead_of(transfer, "owned_cells")
+@instead_of(ownership, "owned_cells")
 def cancel_on_common_promise(
     owned_cells: OwnedCells, state: VehicleState, states: States, gone: Collection[Name]
 ) -> frozenset[Cell] | None:
@@ -464,7 +464,7 @@ def cancel_on_common_promise(
     return owned_cells(state, states, gone)
 
 
-@instead_of(transfer, "owned_cells")
+@instead_of(ownership, "owned_cells")
 def forget_motion(
     owned_cells: OwnedCells, state: VehicleState, *more: object
 ) -> frozenset[Cell] | None:

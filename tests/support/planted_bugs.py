@@ -263,6 +263,7 @@ NOT_A_SAFETY_MATTER: Mapping[Function, str] = {
     ballot.issue: "it only sends the plan",
     ballot.count_acceptance: "it only saves messages",
     transfer.reports_owned_cells: "a plan that transfers no cells is refused by all vehicles",
+    transfer.knows_owners: "without it the ballot is given up, since owners are not known",
     transfer.record_outbid: "it only says why the ballot was given up",
     transfer.record_restart: "likewise",
     transfer.record_reason: "likewise",

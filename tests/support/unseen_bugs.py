@@ -27,8 +27,7 @@ from laneweave.coordinator.formations.stages import Stage
 from laneweave.coordinator.operation import LogEntry
 from laneweave.coordinator.planning.rolling.problem import StreamPlan
 from laneweave.coordinator.rolling import operation as rolling
-from laneweave.coordinator.rolling import ownership, transfer
-from laneweave.coordinator.rolling.known_road import KnownRoad
+from laneweave.coordinator.rolling import ownership
 from laneweave.coordinator.rolling.operation import RollingOperation
 from laneweave.coordinator.rolling.ownership import ReplacedBallots, States
 from laneweave.coordinator.rolling.transfer import CellTransfer
@@ -250,8 +249,7 @@ def newer_transfer_cancels_older(patch: pytest.MonkeyPatch) -> None:
                 return frozenset(pending.before)
         return owned_cells(state, states, gone)
 
-    for module in (ownership, transfer):
-        patch.setattr(module, "owned_cells", mutant)
+    patch.setattr(ownership, "owned_cells", mutant)
 
 
 @breaks("transfer", ownership, "_signs")
@@ -279,13 +277,7 @@ def evidence_is_not_kept(*_: object) -> None:
     """Leaders forget what a vehicle has shown about a replaced ballot when it has a newer one."""
 
 
-@breaks("transfer", KnownRoad, "_brakes", collides=False)
-def braking_vehicles_planned(*_: object) -> bool:
-    """Others need cells of vehicles that brake before a closed part, and wait for them."""
-    return False
-
-
-@breaks("transfer", transfer, "owned_cells")
+@breaks("transfer", ownership, "owned_cells")
 def unknown_cells_guessed(
     owned_cells: Callable[..., frozenset[Cell] | None], state: VehicleState, *more: object
 ) -> frozenset[Cell]:
