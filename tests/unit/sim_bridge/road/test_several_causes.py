@@ -118,7 +118,7 @@ def test_the_same_before_the_end_of_a_lane(seed: int) -> None:
 def test_a_planted_bug_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
     road_bugs.parts_are_closed_before_vehicles_that_start.plant(monkeypatch)
     with pytest.raises(AssertionError):
-        run_to_end(drawn_road(20))
+        run_to_end(drawn_road(34))
 
 
 def run_to_end(road: LonelyRoad) -> None:
