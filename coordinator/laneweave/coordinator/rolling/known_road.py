@@ -96,7 +96,10 @@ class KnownRoad:
             vehicle = self._vehicle(entry, state, s_m, held=keeps_cells, gated=is_gated)
             vehicles.setdefault(cell, vehicle)
             if state is not None:
-                owned |= replaced.cells_before(state, snapshot.states, snapshot.gone)
+                its_cells = replaced.cells_before(state, snapshot.states, snapshot.gone)
+                owned |= its_cells
+                if keeps_cells:
+                    reserved |= its_cells - {cell}
                 reserved |= self._reserved(entry, state, keeps_all=keeps_cells or is_gated)
         columns = [column for column, _ in vehicles] or [0]
         window = range(min(columns) - MARGIN_COLUMNS, max(columns) + MARGIN_COLUMNS + 1)
@@ -288,7 +291,7 @@ def _is_late(state: VehicleState, replaced: ReplacedBallots) -> bool:
     """Return whether a vehicle may still begin a move of the slot before: its gate is open.
 
     With a closed gate it never begins once the vehicle promises the newer ballot. The moves of
-    replaced ballots are dropped.
+    replaced ballots are dropped: their members are asked for newer promises.
     """
     waits = state.go and not state.done and not state.moving
     return waits and (state.record.accepted is None or state.record.accepted not in replaced)

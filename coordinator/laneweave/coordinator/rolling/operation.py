@@ -237,10 +237,12 @@ class RollingOperation:
         self._ordered = None
         t0_s = slot * self._slot_s
         replaced, plan = self._for_slot(slot), computed.result
-        # Moves of replaced ballots must not have begun.
-        late = t_s > (t0_s if replaced else t0_s + MAX_DELAY_S)
-        if not (replaced and late):
-            yield from self._abort(self.transfers, "the next slot is planned")
+        # Moves of earlier ballots for this slot should not have begun.
+        again = any(each.t0_s > t0_s - 1e-6 for each in self.transfers)
+        late = t_s > (t0_s if again else t0_s + MAX_DELAY_S)
+        if not again or (isinstance(plan, StreamPlan) and not late):
+            reason = "the slot is planned again" if again else "the next slot is planned"
+            yield from self._abort(self.transfers, reason)
         if not isinstance(plan, StreamPlan):
             yield LogEntry(PLANNING_FAILED, {"slot": slot, "error": computed.error})
             return
@@ -261,7 +263,7 @@ class RollingOperation:
         yield LogEntry(STREAM_PLANNED, self._log_data(plan) | {"out_of_reach": out_of_reach})
 
     def _for_slot(self, slot: int) -> list[CellTransfer]:
-        """Return the newest ballots for a slot whose plans vehicles may have accepted."""
+        """Return the newest ballots for a slot whose plans have been sent."""
         return [
             each
             for each in self.transfers
@@ -322,9 +324,10 @@ class RollingOperation:
             and each.moves == {name: moves[name] for name in each.roster if name in moves}
         }
         # Others promise one by one: one that is not ready must not keep the others waiting.
-        earlier = [{*roster} for roster in same]
-        earlier += [{name} for each in replaced if each.roster not in same for name in each.roster]
-        for members in _clusters([*rosters.values(), *(each & states.keys() for each in earlier)]):
+        kept = {name for roster in same for name in roster}
+        asked = [{name} for name in sorted(self._replaced.to_ask(states) - kept)]
+        earlier = [{*roster} & states.keys() for roster in same]
+        for members in _clusters([*rosters.values(), *earlier, *asked]):
             roster = tuple(sorted(members))
             if roster in same:
                 self._replaced.keep(same[roster].ballot)
@@ -346,7 +349,7 @@ class RollingOperation:
     def _with_partners(self, names: set[Name]) -> set[Name]:
         """Add the vehicles whose promises determine what the others own.
 
-        The members of replaced ballots promise newer ones in any case.
+        Members of replaced ballots that have not promised newer ones are asked in any case.
         """
         roster, waiting, states = set(names), sorted(names), self.observed.states
         while waiting:

@@ -111,8 +111,21 @@ class ReplacedBallots:
     def on_state(self, state: VehicleState) -> None:
         """Note what a newer state of a vehicle shows."""
         for ballot, members in self._members.items():
-            if state.vehicle in members and _sign(state, ballot) in _LASTING:
-                self._shown[ballot].setdefault(state.vehicle, state)
+            if state.vehicle not in members:
+                continue
+            sign, shown = _sign(state, ballot), self._shown[ballot]
+            # One that was never ready says more than that its own gate is closed.
+            if sign is _Sign.NEVER_READY or (sign in _LASTING and state.vehicle not in shown):
+                shown[state.vehicle] = state
+
+    def to_ask(self, states: States) -> set[Name]:
+        """Return the members that have promised no higher ballot: they have not dropped theirs."""
+        return {
+            name
+            for ballot, members in self._members.items()
+            for name in members
+            if name in states and (states[name].record.promised or ballot) <= ballot
+        }
 
     def forget(self, states: States) -> None:
         """Forget the ballots of which no vehicle stores a transfer."""
@@ -134,9 +147,10 @@ class ReplacedBallots:
     def cells_before(
         self, state: VehicleState, states: States, gone: Collection[Name]
     ) -> frozenset[Cell]:
-        """Return the cells that a vehicle owns for certain once all have promised higher ballots.
+        """Return the cells that a vehicle owns for certain.
 
-        Of a replaced ballot these are the cells `before`, unless its gate is known to be open.
+        Of a replaced ballot these are the cells `before` unless its gate is known to be open, since
+        it is expected that all members promise higher ballots with closed gates.
         """
         transfer = state.record.transfer
         if transfer is None or transfer.ballot not in self:
@@ -157,7 +171,7 @@ class _Sign(Enum):
 
 
 _LASTING = (_Sign.OPEN, _Sign.CLOSED, _Sign.NEVER_READY)
-"""Evidence that a newer transfer of the vehicle hides."""
+"""Evidence that a vehicle no longer shows when it has a newer transfer."""
 
 
 def _signs(

@@ -32,7 +32,7 @@ from laneweave.protocol.runtime.node import Compute, Computed
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.formation_table import READY_LATE_S, SNAPSHOT_S
 from laneweave.protocol.vehicle.lane_ends import re_entry
-from laneweave.protocol.wire.events import PLANNING_LATE
+from laneweave.protocol.wire.events import PLANNING_FAILED, PLANNING_LATE
 from laneweave.protocol.wire.messages import (
     Ballot,
     Census,
@@ -291,7 +291,35 @@ def test_a_slot_may_be_planned_a_third_time() -> None:
     call = desk.call(LOOK_S + 2.0)
     assert not any(one.held or one.waits for one in call.vehicles.values())
     assert (0, 1) not in call.blocked
+    assert {one.roster for one in desk.control.transfers} == {(A,), (B,)}
     assert all(earlier.ballot in one.replaced for one in desk.control.transfers)
+
+
+def test_a_member_of_a_replaced_ballot_is_asked_until_it_promises() -> None:
+    desk = bench(A, B, ways={A: ((0, 0), (0, 1))})
+    earlier = in_force_when_a_part_is_closed(desk, {})
+    desk.think(LOOK_S + 1.0)
+    newest = desk.control.transfers[0].ballot
+    pending = PendingTransfer(earlier.ballot, OWNED[A], OWNED[A], (A, B))
+    desk.hear(changed(shown(A, newest, pending), t_s=BEGUN_S + 2.0))
+    desk.think(LOOK_S + SLOT_S)
+    assert [one.roster for one in desk.control.transfers] == [(B,)]
+
+
+@pytest.mark.parametrize("late_s", [-0.1, 0.1])
+def test_a_failed_or_late_second_plan_leaves_the_first_ballots_as_they_are(late_s: float) -> None:
+    desk = bench(A, B, ways={A: ((0, 0), (0, 1))})
+    desk.think()
+    earlier = desk.transfer
+    desk.control.on_obstacles(TemporaryParts((PART,)))
+    compute = desk.order(LOOK_S + 1.0)
+    assert compute is not None
+    failed = Computed(compute.job, None, "no") if late_s < 0.0 else None
+    computed = failed or Computed(compute.job, compute.work(time.monotonic))
+    notes = list(desk.control.finish(computed, BEGUN_S + SLOT_S + late_s, 50.0))
+    assert [note.kind for note in notes] == [PLANNING_FAILED if failed else PLANNING_LATE]
+    assert desk.control.transfers == [earlier]
+    assert earlier.unfinished
 
 
 def test_a_plan_does_not_wait_for_a_member_of_a_replaced_ballot_that_leaves_the_lattice() -> None:

@@ -179,3 +179,20 @@ def test_replaced_ballots_are_forgotten_when_no_vehicle_stores_their_transfer() 
     assert MID not in replaced
     assert not replaced
     assert replaced.owned_cells(CLOSED, {}, {B, C}) == owned_cells(CLOSED, {}, {B, C})
+
+
+def test_a_member_that_was_never_ready_says_more_than_that_its_gate_is_closed() -> None:
+    replaced = ReplacedBallots()
+    moving = replace(state(B, BETWEEN, TRANSFER_OF_B), moving=True)
+    replaced.replace(MID, (A, B, C), {B: moving})
+    assert replaced.owned_cells(CLOSED, {}, {C}) == SURE
+    replaced.on_state(replace(moving, moving=False, hold_cell=STRANDED))
+    assert replaced.owned_cells(CLOSED, {B: MOVED_ON}, {C}) == OWNED_BEFORE
+
+
+def test_members_that_have_promised_no_higher_ballot_are_asked() -> None:
+    replaced = ReplacedBallots()
+    replaced.replace(MID, (A, B, C), {})
+    states = {A: CLOSED, B: state(B, MID, TRANSFER_OF_B), C: state(C, None)}
+    assert replaced.to_ask(states) == {B, C}
+    assert replaced.to_ask({A: CLOSED}) == set()
