@@ -65,21 +65,23 @@ class KnownRoad:
         self,
         transfers: Sequence[CellTransfer],
         replaced: ReplacedBallots,
-        temporary: TemporaryParts = NO_PARTS,
+        open_road: OpenRoad,
+        closed: Sequence[TemporaryClosure] = (),
     ) -> tuple[tuple[StreamVehicle, ...], frozenset[Cell]]:
         """Return the vehicles to plan for, and the cells that no plan may use.
 
         Args:
             transfers: ballots for the slot before.
             replaced: ballots that vehicles have dropped, or will drop for this plan.
-            temporary: parts of lanes that are not open as always.
+            open_road: the road as plans may use it.
+            closed: parts of lanes that are closed for a time.
         """
         snapshot, lattice = self.snapshot, self.scenario.lattice
         vehicles: dict[Cell, StreamVehicle] = {}
         owned, reserved = set[Cell](), set[Cell]()
         far_m = self.scenario.geometry.moves_from_m - LOOKAHEAD_M
         gated = self._gated(transfers)
-        ending = self._ending(temporary.closed)
+        ending = self._ending(open_road.sections, closed)
         # Vehicles without a state come last: they may have moved, and others may hold their cells.
         for entry in sorted(
             snapshot.census.on_lattice, key=lambda entry: entry.vehicle not in snapshot.states
@@ -154,10 +156,12 @@ class KnownRoad:
                 sections[number] = evolve(sections[number], to_m=queue_m)
         return sections
 
-    def _ending(self, closed: Sequence[TemporaryClosure]) -> list[tuple[LaneSection, float]]:
+    def _ending(
+        self, sections: Sequence[LaneSection], closed: Sequence[TemporaryClosure]
+    ) -> list[tuple[LaneSection, float]]:
         """Return the sections that end suddenly, up to the queue, and where the parts begin."""
-        always, found = len(self.scenario.geometry.sections), []
-        for section in self._open_sections(closed)[always:] if closed else ():
+        found = []
+        for section in sections[len(self.scenario.geometry.sections) :]:
             ahead = (part.from_m for part in closed if part.lane == section.lane)
             found.append((section, min(each for each in ahead if each >= section.to_m)))
         return found

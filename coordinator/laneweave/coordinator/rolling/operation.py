@@ -215,7 +215,10 @@ class RollingOperation:
         for each in self._for_slot(slot + 1):
             replaced.replace(each.ballot, each.roster, self.observed.states)
         before = [*self._in_progress, *self._for_slot(slot)]
-        vehicles, blocked = known.vehicles_and_blocked_cells(before, replaced, self._temporary)
+        open_road = known.open_road(self._temporary)
+        vehicles, blocked = known.vehicles_and_blocked_cells(
+            before, replaced, open_road, self._temporary.closed
+        )
         self._newest_slot = slot + 1
         job = self._new_job()
         self._ordered = (job, slot + 1)
@@ -225,7 +228,7 @@ class RollingOperation:
             vehicles,
             self._last_plan,
             blocked,
-            known.open_road(self._temporary),
+            open_road,
         )
         yield Compute(job, partial(_without_deadline, plan))
 

@@ -74,10 +74,11 @@ def partners(state: VehicleState, states: States) -> frozenset[Name]:
 
 @define
 class ReplacedBallots:
-    """Ballots whose vehicles drop their moves, and what these have shown about the start gates.
+    """Replaced ballots, and what their members have reported about the start gates.
 
-    The members promise higher ballots one by one. What one has shown stays true when it has a newer
-    transfer, so it is kept as long as any vehicle stores a transfer of the ballot.
+    The members drop their moves when they promise higher ballots, one by one. What a member has
+    reported stays true when it has a newer transfer, so it is kept as long as any vehicle stores a
+    transfer of the ballot.
     """
 
     _shown: dict[Ballot, dict[Name, VehicleState]] = field(factory=dict)
@@ -85,7 +86,7 @@ class ReplacedBallots:
     _members: dict[Ballot, tuple[Name, ...]] = field(factory=dict)
 
     def __contains__(self, ballot: Ballot) -> bool:
-        """Return whether a ballot is one of them."""
+        """Return whether a ballot has been replaced."""
         return ballot in self._members
 
     def __bool__(self) -> bool:

@@ -44,7 +44,7 @@ class StopLinesAhead:
         ahead: Iterable[Neighbour],
         speed_mps: float,
     ) -> bool:
-        """Return whether the lane of a move has ended before the body has entered it.
+        """Return whether the body may not enter the lane of its hold cell, which has ended.
 
         The vehicle drives past in its own lane, and the cells of its move stay its own. A closed
         part grows while a vehicle breaks down: beyond it, slower vehicles ahead in the other lane
@@ -57,13 +57,18 @@ class StopLinesAhead:
             ahead: measured neighbours ahead.
             speed_mps: speed of the vehicle.
         """
-        ended = body_lane != hold_cell[1] and self.lane_ends.has_passed(hold_cell, t_s)
-        if not ended and hold_cell == self._kept_out_of:
-            ended = body_lane != hold_cell[1] and any(
-                one.lane == hold_cell[1] and one.speed_mps < speed_mps - SLOWER_MPS for one in ahead
+        goal = hold_cell[1]
+        kept_out = body_lane != goal and (
+            self.lane_ends.has_passed(hold_cell, t_s)
+            or (
+                hold_cell == self._kept_out_of
+                and any(
+                    one.lane == goal and one.speed_mps < speed_mps - SLOWER_MPS for one in ahead
+                )
             )
-        self._kept_out_of = hold_cell if ended else None
-        return ended
+        )
+        self._kept_out_of = hold_cell if kept_out else None
+        return kept_out
 
     def start(self, goal: int, lane: int, s_m: float) -> None:
         """Start from standing towards a lane, from a position in another or the same one."""

@@ -357,7 +357,7 @@ class LaneEndControl:
         return vehicle.state[0] <= self._ends[at].line_m + NEAR_LINE_M
 
     def _may_start(self, at: LanePosition, vehicle: RoadVehicle, at_s: float) -> bool:
-        """Return whether a vehicle may start at a road time, and has room to, where it waits.
+        """Return whether a vehicle that waits may start at a road time, and has room to start.
 
         One that has broken down may start in its own lane once it is repaired.
         """

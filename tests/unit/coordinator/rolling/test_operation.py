@@ -254,7 +254,7 @@ def test_a_ballot_with_other_moves_is_replaced_when_a_slot_is_planned_again() ->
     call = desk.call(LOOK_S + 1.0)
     assert not any(one.held or one.waits for one in call.vehicles.values())
     assert (0, 1) not in call.blocked
-    # All drop the move when they promise, also the one whose gate is open.
+    # Each vehicle drops its moves when it promises, also one with an open gate.
     prepares = dict(desk.control.outgoing(50.0))
     assert {*prepares} == {A, B}
     assert all(
@@ -283,7 +283,7 @@ def test_one_that_brakes_before_a_closed_part_keeps_its_cells(
 
 
 def test_a_slot_may_be_planned_a_third_time() -> None:
-    """The transfers that vehicles store are then those of the ballot before the last."""
+    """Vehicles still store the transfers of the first ballot then."""
     desk = bench(A, B, ways={A: ((0, 0), (0, 1))})
     earlier = in_force_when_a_part_is_closed(desk, {A: ((0, 0), (1, 0))})
     desk.think(LOOK_S + 1.0)
