@@ -14,7 +14,7 @@ from laneweave.coordinator.core import CoordinatorCore
 from laneweave.coordinator.election import Election
 from laneweave.coordinator.formations import operation
 from laneweave.coordinator.formations.leader import FormationLeader
-from laneweave.coordinator.formations.roster import Formation, Groups
+from laneweave.coordinator.formations.roster import Formation, Groups, Numbers
 from laneweave.coordinator.formations.stages import Stage
 from laneweave.coordinator.rolling import ownership, transfer
 from laneweave.coordinator.rolling.ownership import States
@@ -317,12 +317,12 @@ def close_at_once(
     t_s: float,
     scenario: Scenario,
     groups: Groups,
-    of_road: Sequence[Stage] = (),
+    stages_of: Callable[[Numbers], Sequence[Stage]] | None = None,
 ) -> dict[int, Formation]:
     blocks = sorted({scenario.lattice.block_of(entry.cell[0]) for entry in census.on_road})
     closed = tuple(ClosedFormation(block, block, 0.0) for block in blocks)
     early = replace(census, formations=closed, closed_to=FAR_BEHIND)
-    return closed_formations(early, t_s, scenario, groups, of_road)
+    return closed_formations(early, t_s, scenario, groups, stages_of)
 
 
 def close_early(patch: Patch) -> None:

@@ -99,7 +99,7 @@ class LonelyRoad:
         self.roadside.demand.newly_demanded(t_s)
         for admission in self.roadside.admit(t_s, self.vehicles):
             vehicle = RoadVehicle.entering(admission, t_s, scenario, 1)
-            vehicle.close(self.roadside.lane_ends)
+            vehicle.close(self.roadside.lane_ends, self.t_s)
             self.vehicles[vehicle.name] = vehicle
         for change in self.roadside.control_lane_ends(self.vehicles, t_s):
             self.events.append((t_s, change.kind, change.vehicle))

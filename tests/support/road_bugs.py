@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 
 import pytest
 from attrs import evolve
@@ -197,8 +197,8 @@ def line_forgotten_when_driving_out(patch: Patch) -> None:
     """The way out is blocked by the line at which the vehicle stands."""
     re_entry = MotionController.re_enter
 
-    def mutant(self: MotionController, cell: Cell) -> None:
-        re_entry(self, cell)
+    def mutant(self: MotionController, cell: Cell, open_lanes: Iterable[int]) -> None:
+        re_entry(self, cell, open_lanes)
         self.stop_lines.passed = False
 
     patch.setattr(MotionController, "re_enter", mutant)
@@ -375,13 +375,10 @@ def exits_are_closed(left_by: Callable[..., object], self: Exits, lane: int, s_m
 
 
 @breaks(RAMPS, MotionController, "return_to_origin")
-def late_commands_repeat_moves(
-    back: Callable[..., bool], self: MotionController, t_s: float
-) -> bool:
+def late_commands_repeat_moves(back: Callable[..., bool], self: MotionController) -> bool:
     """A vehicle that holds its cell again executes a late command for the move."""
-    tick = self.command_tick
-    done = back(self, t_s)
-    self.command_tick = tick
+    done = back(self)
+    self.stop_lines.taken_back = None
     return done
 
 

@@ -22,7 +22,7 @@ from laneweave.coordinator.core import CoordinatorCore
 from laneweave.coordinator.formations import operation as formations
 from laneweave.coordinator.formations.formation_planner import FormationPlanner
 from laneweave.coordinator.formations.leader import FormationLeader
-from laneweave.coordinator.formations.roster import Formation, Groups
+from laneweave.coordinator.formations.roster import Formation, Groups, Numbers
 from laneweave.coordinator.formations.stages import Stage
 from laneweave.coordinator.operation import LogEntry
 from laneweave.coordinator.planning.rolling.problem import StreamPlan
@@ -168,7 +168,7 @@ def joined_with_an_open_formation(
     t_s: float,
     scenario: Scenario,
     groups: Groups,
-    of_road: Sequence[Stage] = (),
+    stages_of: Callable[[Numbers], Sequence[Stage]] | None = None,
 ) -> dict[int, Formation]:
     """A joint formation counts as closed once its foremost block is closed."""
     for closed in census.formations:
@@ -177,7 +177,7 @@ def joined_with_an_open_formation(
     begun = [groups.of(block) for block in blocks if groups.of(block)[0] <= census.closed_to]
     last = max((numbers[-1] for numbers in begun), default=census.closed_to)
     closed_to = max(census.closed_to, last)
-    return closed_formations(replace(census, closed_to=closed_to), t_s, scenario, groups, of_road)
+    return closed_formations(replace(census, closed_to=closed_to), t_s, scenario, groups, stages_of)
 
 
 @breaks("L3", formations.FormationsOperation, "_lead_formation", collides=False)

@@ -44,7 +44,7 @@ from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.vehicle_tables import Vehicle
 from laneweave.protocol.state_machine import RuleBook
 from laneweave.protocol.vehicle.execution_rules import VEHICLE_RULES
-from laneweave.protocol.vehicle.lane_ends import LaneEnds
+from laneweave.protocol.vehicle.lane_ends import SOON_S, LaneEnds
 from laneweave.protocol.vehicle.motion import displaced
 from laneweave.protocol.vehicle.plan_execution import PlanExecution
 from laneweave.protocol.vehicle.territory import territory_of
@@ -74,6 +74,10 @@ from laneweave.protocol.wire.topics import (
     STATE,
     VEHICLE_ALIVE,
 )
+
+MAX_REPEATS = 50
+"""Maximum number of ticks in which a process repeats a move that the motion controller does not
+begin. The messages may be lost, or the move taken back."""
 
 
 class _Claim:
@@ -139,6 +143,8 @@ class AgentCore:
         """Blocks whose states are needed now."""
         self._begun: tuple[PlannedMove, int] | None = None
         """The move that was begun last, and its duration in ticks."""
+        self._begun_with = 0, self._lane_ends
+        """The tick in which it was begun first, and the ends of lanes as known then."""
         self._sense: Sense | None = None
         self._command: Command | None = None
         self._own = {"vehicle": vehicle}
@@ -292,8 +298,13 @@ class AgentCore:
         It has left the lattice and entered it again while no SENSE arrived, or it is too late for
         the move that this process has begun or may begin.
         """
-        execution = self.execution
-        if execution is None or not self._lane_ends:
+        execution, (begin_tick, known) = self.execution, self._begun_with
+        if execution is None:
+            return False
+        begins = self._begun is not None and sense.hold_cell != execution.hold_cell
+        if begins and sense.tick > begin_tick + MAX_REPEATS:
+            return True
+        if not self._lane_ends:
             return False
         if sense.hold_cell == execution.hold_cell:
             # An open gate for a move that can no longer begin would keep leaders waiting.
@@ -303,8 +314,13 @@ class AgentCore:
         (_, origin, target), _ = self._begun
         # The motion controller refuses a whole move into a part that is closed or cleared.
         slot_s = execution.plan.slot_s if self._temporary and execution.plan is not None else None
-        late = self._lane_ends.too_late(origin, target, sense.t_s, slot_s)
-        return sense.hold_cell != origin or late
+        ends = self._lane_ends
+        return (
+            sense.hold_cell != origin
+            or ends.too_late(origin, target, sense.t_s, slot_s)
+            # The motion controller has taken the move back. Its clock may be another one.
+            or (ends is not known and ends.closed_soon(target, sense.t_s, 2.0 * SOON_S))
+        )
 
     def _wait(self, sense: Sense) -> list[Effect]:
         """Keep the claim on a vehicle without a cell, which its motion controller drives alone."""
@@ -408,6 +424,7 @@ class AgentCore:
             displaced=displaced(sense.measured, scenario.lattice, cell, sense.t_s, room_ahead_m),
         )
         if move is not None and execution.plan is not None:
+            self._begun_with = sense.tick, self._lane_ends
             self._begin(move, scenario.timing.move_ticks(execution.plan.slot_s), sense.tick)
 
     def _begin(self, move: PlannedMove, lasts_ticks: int, tick: int) -> None:

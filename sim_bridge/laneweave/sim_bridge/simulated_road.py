@@ -159,7 +159,7 @@ class SimulatedRoad(Generic[VehicleT]):
         entered, self.at_entrance = self.at_entrance, []
         for vehicle in entered:
             vehicle.controller.occupancy = self._occupied_cells
-            vehicle.close(self._roadside.lane_ends)
+            vehicle.close(self._roadside.lane_ends, self.t_s)
             self.vehicles[vehicle.name] = vehicle
             self._record.on_entered(vehicle)
         return entered

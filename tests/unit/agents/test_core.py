@@ -8,9 +8,10 @@ import attrs
 import pytest
 from msgspec.structs import replace
 
-from laneweave.agents.core import AgentCore
+from laneweave.agents.core import MAX_REPEATS, AgentCore
 from laneweave.agents.driving.driver import TrackingDriver
 from laneweave.protocol.lattice import Cell, PlannedMove
+from laneweave.protocol.road_layout import TemporaryClosure, TemporaryParts
 from laneweave.protocol.runtime import node
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.vehicle_tables import Vehicle, VehicleTypeSettings
@@ -260,7 +261,7 @@ def test_without_a_cell_it_begins_anew_and_only_keeps_its_claim() -> None:
         assert rig.hand(topics.PREPARE, Prepare(BALLOT, (0,), (ME,))) == []
         assert rig.hand(topics.PLAN, plan) == []
     there: Cell = (-5, 1)
-    controller.re_enter(there)
+    controller.re_enter(there, ())
     controller.enter_lattice([there])
     rig.coast(1)
     (command,) = sent(rig.hand(topics.SENSE, rig.sense()), Command)
@@ -276,7 +277,7 @@ def test_it_begins_anew_if_its_vehicle_has_entered_the_lattice_again_unseen() ->
     rig.accept((0, HOME, (-1, 2)))
     controller, there = rig.controller, (-5, 1)
     controller.leave_lattice()
-    controller.re_enter(there)
+    controller.re_enter(there, ())
     controller.enter_lattice([there])
     rig.coast(30)
     for _ in range(2):
@@ -286,6 +287,53 @@ def test_it_begins_anew_if_its_vehicle_has_entered_the_lattice_again_unseen() ->
         rig.coast(1)
     assert rig.agent.in_charge
     assert rig.shown[-1].hold_cell == there
+
+
+@pytest.mark.parametrize("knows", [True, False])
+def test_it_begins_anew_when_its_move_into_a_closed_lane_is_taken_back(knows: bool) -> None:
+    """At once if it knows the part; else its commands have no effect for some ticks."""
+    rig, target = up_and_running(), (HOME[0], 2)
+    rig.accept((0, HOME, target))
+    while rig.controller.hold_cell != target:
+        rig.answer()
+    near_m = rig.state[0] + 220.0
+    parts = TemporaryParts((TemporaryClosure(2, near_m, near_m + 10.0),))
+    assert rig.vehicle.close(LaneEnds(SCENARIO, parts), rig.tick * TICK_S)
+    if knows:
+        rig.agent.on_obstacles(parts)
+    repeats, incarnation = 0, rig.controller.record.incarnation
+    while rig.controller.record.incarnation == incarnation:
+        (command,) = sent(rig.hand(topics.SENSE, rig.sense()), Command)
+        repeats += not rig.controller.accept_command(command)
+        # It is no fault of the agent's.
+        assert (rig.controller.hold_cell, rig.controller.refusal) == (HOME, None)
+        rig.coast(1)
+        assert repeats <= MAX_REPEATS + 2
+    assert (repeats == 0) is knows
+    # With a new plan it may move there, if it arrives before the line: if it has waited, it is late.
+    state = rig.run(30)
+    assert (state.hold_cell, state.moving) == (HOME, False)
+    if knows:
+        rig.accept((0, HOME, target), ballot=BALLOT._replace(seq=9))
+        rig.run()
+        assert rig.controller.hold_cell == target
+
+
+@pytest.mark.parametrize(("ahead_m", "back"), [(150.0, True), (450.0, False), (20.0, False)])
+def test_only_moves_into_lanes_that_are_closed_soon_are_taken_back(
+    ahead_m: float, back: bool
+) -> None:
+    rig = up_and_running()
+    rig.accept((0, HOME, (HOME[0], 2)))
+    while rig.controller.hold_cell == HOME:
+        rig.answer()
+    if ahead_m < 100.0:
+        ahead_m = 150.0
+        rig.run(20)  # the body is in the other lane
+    near_m = rig.state[0] + ahead_m
+    parts = TemporaryParts((TemporaryClosure(2, near_m, near_m + 10.0),))
+    assert rig.vehicle.close(LaneEnds(SCENARIO, parts), rig.tick * TICK_S) is back
+    assert (rig.controller.hold_cell == HOME) is back
 
 
 def test_an_agent_drives_its_type_and_takes_no_plan_that_the_type_cannot_drive() -> None:

@@ -99,11 +99,11 @@ class FormationLeader(BallotRound):
         """Update the formation from a newer census (L8)."""
         if formation == self.formation:
             return
+        self.take(MEMBERS, now_s, formation)
         for vehicle in set(self.formation.roster) - set(formation.roster):
             self.states.pop(vehicle, None)
             self.ages.pop(vehicle, None)
             self.reconsider()
-        self.take(MEMBERS, now_s, formation)
         self.formation = formation
 
     def reconsider(self) -> None:
@@ -249,6 +249,12 @@ def has_new_targets(leader: FormationLeader, formation: Formation) -> bool:
     )
 
 
+def has_lost_member(leader: FormationLeader, formation: Formation) -> bool:
+    """A member has left that has not completed the plan: it has stopped, and others await it."""
+    left = set(leader.formation.roster) - set(formation.roster)
+    return any(name in left and not state.done for name, state in leader.states.items())
+
+
 _OBSERVING, _PREPARING, _PLANNING, _ISSUING, _IN_FORCE, _BACKING_OFF, _ = (
     (phase,) for phase in BallotPhase
 )
@@ -276,6 +282,7 @@ LEADER_RULES: RuleBook = RuleBook(
         Transition("L8", STATE, _IN_FORCE, (is_off_lane,), *_PREPARE),
         Transition("L8", MEMBERS, UNFINISHED, (), *_PREPARE),
         Transition("L8", MEMBERS, _IN_FORCE, (has_new_targets,), *_PREPARE),
+        Transition("L8", MEMBERS, _IN_FORCE, (has_lost_member,), *_PREPARE),
     )
 )
 """Rules L2 to L8 of formations."""

@@ -14,14 +14,15 @@ from laneweave.coordinator.formations.leader import FormationLeader
 from laneweave.coordinator.formations.roster import (
     Formation,
     Groups,
+    Numbers,
     closed_formations,
     joinable,
     stage_begin_s,
 )
-from laneweave.coordinator.formations.stages import Stage, stages, with_queues
+from laneweave.coordinator.formations.stages import Stage, stages, where_overtaken, with_queues
 from laneweave.coordinator.operation import LogEntry, to_vehicle
 from laneweave.coordinator.planning.response import PlanFunction
-from laneweave.protocol.road_layout import TemporaryClosure, TemporaryParts
+from laneweave.protocol.road_layout import NO_PARTS, TemporaryClosure, TemporaryParts
 from laneweave.protocol.runtime.node import Compute, Computed, Effect
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.state_machine import RuleBook
@@ -67,21 +68,22 @@ class FormationsOperation:
         self._rng = rng
         self._rules = rules
         self._groups = Groups()
-        self._closed: tuple[TemporaryClosure, ...] = ()
-        """Parts of lanes that are closed for a time, or about to be closed."""
+        self._parts = NO_PARTS
+        """Parts of lanes that are closed for a time or about to be closed, and what is cleared for
+        fast vehicles."""
         self._heed_nothing()
         self._planner = FormationPlanner(scenario, self._groups, self.leaders, new_job, plan)
 
     def forget(self) -> None:
         """Discard all formations and all joins."""
         self._groups.forget()
-        self._closed = ()
+        self._parts = NO_PARTS
         self._heed_nothing()
         self.take_over()
 
     def _heed_nothing(self) -> None:
-        self._heeded: tuple[TemporaryClosure, ...] = ()
-        """Closed parts, and the queues before them, with which formations plan now."""
+        self._heeded = NO_PARTS
+        """Parts, with the queues before closed ones, with which formations plan now."""
         self._heeded_s = -math.inf
         """Road time of the last change of these."""
         self._heed_again_s = math.inf
@@ -93,15 +95,13 @@ class FormationsOperation:
         self._planner.forget()
 
     def on_obstacles(self, temporary: TemporaryParts) -> None:
-        """Plan with other parts of lanes that are closed, or about to be closed.
-
-        Formations do not clear lanes for vehicles of other systems, which move.
-        """
+        """Plan with other parts of lanes that are closed or about to be closed, or cleared."""
         at_rest = (one for one in temporary.cleared if one.speed_mps == 0.0)
         soon = (TemporaryClosure(one.lane, one.from_m, one.to_m) for one in at_rest)
-        closed = (*temporary.closed, *soon)
-        if closed != self._closed:
-            self._closed = closed
+        moving = tuple(one for one in temporary.cleared if one.speed_mps > 0.0)
+        parts = TemporaryParts((*temporary.closed, *soon), moving)
+        if parts != self._parts:
+            self._parts = parts
             self._groups.changed = True
 
     def on_clock(self, t_s: float, now_s: float) -> None:
@@ -146,12 +146,12 @@ class FormationsOperation:
 
     def _update_members(self, census: Census, t_s: float, now_s: float) -> Iterator[LogEntry]:
         scenario, groups = self._scenario, self._groups
-        of_road = self._stages(census, t_s)
-        formations = closed_formations(census, t_s, scenario, groups, of_road)
+        self._heed(census, t_s)
+        formations = closed_formations(census, t_s, scenario, groups, self._stages_of)
         for numbers in joinable(formations, t_s, scenario):
             groups.join(numbers)
             yield LogEntry(FORMATIONS_JOINED, {"formations": list(numbers), "why": "room"})
-            formations = closed_formations(census, t_s, scenario, groups, of_road)
+            formations = closed_formations(census, t_s, scenario, groups, self._stages_of)
         groups.forget_departed(census, scenario.lattice.block_of)
         for number in set(self.leaders) - set(formations):
             del self.leaders[number]
@@ -161,24 +161,29 @@ class FormationsOperation:
                 self.leaders[number] = self._lead_formation(formation, t_s, now_s)
                 self._reconsider_neighbours(formation)
             else:
-                known = self._with_stage(formation, leader, of_road, t_s)
+                known = self._with_stage(formation, leader, t_s)
                 leader.on_members(known, now_s)
 
-    def _stages(self, census: Census, t_s: float) -> Sequence[Stage]:
-        """Return the stages of the road; changes of closed parts take effect once in `HEED_S`.
+    def _heed(self, census: Census, t_s: float) -> None:
+        """Let changes of closed and cleared parts take effect, once in `HEED_S`.
 
         After each change, every formation may plan again. Queues and slow vehicles of other systems
         change parts several times in a second.
         """
-        closed = with_queues(self._closed, census, self._scenario)
-        if closed != self._heeded and t_s >= self._heeded_s + HEED_S:
-            self._heeded, self._heeded_s = closed, t_s
-        self._heed_again_s = math.inf if closed == self._heeded else self._heeded_s + HEED_S
-        return stages(self._scenario, self._heeded)
+        closed = with_queues(self._parts.closed, census, self._scenario)
+        parts = TemporaryParts(closed, self._parts.cleared)
+        if parts != self._heeded and t_s >= self._heeded_s + HEED_S:
+            self._heeded, self._heeded_s = parts, t_s
+        self._heed_again_s = math.inf if parts == self._heeded else self._heeded_s + HEED_S
 
-    def _with_stage(
-        self, formation: Formation, leader: FormationLeader, of_road: Sequence[Stage], t_s: float
-    ) -> Formation:
+    def _stages_of(self, numbers: Numbers) -> Sequence[Stage]:
+        """Return the stages of the road for the formation with these blocks."""
+        block_range, heeded = self._scenario.lattice.block_range, self._heeded
+        columns = range(block_range(numbers[-1]).start, block_range(numbers[0]).stop)
+        overtaken = where_overtaken(heeded.cleared, columns, self._scenario)
+        return stages(self._scenario, heeded.closed, overtaken)
+
+    def _with_stage(self, formation: Formation, leader: FormationLeader, t_s: float) -> Formation:
         """Return a formation, with the stage its leader has planned for if that plan still serves.
 
         Parts that are closed for a time change the stages of formations that have passed them, and
@@ -188,7 +193,7 @@ class FormationsOperation:
         stage, before = formation.stage, leader.formation
         goals = before.goal_lanes
         if (
-            before.stage in of_road
+            before.stage in self._stages_of(formation.numbers)
             or formation.sorts != before.sorts
             or not formation.goal_lanes.keys() <= goals.keys()
         ):

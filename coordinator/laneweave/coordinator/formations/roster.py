@@ -116,7 +116,7 @@ def closed_formations(
     t_s: float,
     scenario: Scenario,
     groups: Groups,
-    of_road: Sequence[Stage] = (),
+    stages_of: Callable[[Numbers], Sequence[Stage]] | None = None,
 ) -> dict[int, Formation]:
     """Return the closed formations on the road by their lowest block number.
 
@@ -128,9 +128,10 @@ def closed_formations(
         t_s: road time.
         scenario: lattice, structures.
         groups: blocks planned together; the blocks of each closed formation are merged here.
-        of_road: stages of the road as it is now; empty: no part is closed for a time.
+        stages_of: returns the stages of the road for a formation as they are now; None: no part
+            is closed for a time, and no vehicle overtakes.
     """
-    lattice, of_road = scenario.lattice, of_road or stages(scenario)
+    lattice = scenario.lattice
     closed_s: dict[int, list[float]] = {}
     for closed in census.formations:
         groups.join(closed.blocks)
@@ -145,6 +146,7 @@ def closed_formations(
     for first, each in sorted(members.items()):
         numbers, times_s = groups.of(first), closed_s.get(first, [0.0])
         if numbers[-1] <= census.closed_to:
+            of_road = stages_of(numbers) if stages_of else stages(scenario)
             stage = stage_at(numbers, t_s, of_road, scenario)
             each.sort(key=lambda entry: entry.vehicle)
             goals = (stage.goal_lanes(entry.preferred_lane, entry.destination) for entry in each)
@@ -205,9 +207,10 @@ def moves_end_s(
 ) -> float:
     """Return the road time by which moves from and to some cells should be complete.
 
-    A cell of a lane that ends passes the end of the stage then; in the last stage, any cell.
+    A cell of a lane that ends passes the end of the stage then; in the last stage, any cell. For a
+    vehicle that overtakes the formation, its lane must be free at one time.
     """
-    to_m, ends_s = stage.to_m, stage_end_s(numbers, stage, scenario)
+    to_m, ends_s = stage.to_m, min(stage_end_s(numbers, stage, scenario), stage.until_s)
     if stage.is_last:
         return exit_time_s(cells, scenario, to_m)
     ending = [cell for cell in cells if cell[1] in stage.ending_lanes]

@@ -8,35 +8,57 @@ Before the end of a stage, each vehicle should be in one of its goal lanes: thos
 destination. If none of them is open yet, it needs the nearest lane that goes on behind the stage.
 
 Parts of lanes that are closed for a time add stages in which vehicles leave these lanes
-(docs/adr/0065).
+(docs/adr/0065), and so do fast vehicles that overtake a formation (docs/adr/0064).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from functools import cached_property, lru_cache
 from itertools import pairwise
 from operator import itemgetter
+from typing import NamedTuple
 
 from attrs import evolve, field, frozen
 
 from laneweave.protocol.road_layout import (
     ANY_LANE,
     END_OF_ROAD,
+    ClearedPart,
     LaneSection,
     TemporaryClosure,
     cut,
 )
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.formation_table import DrivingStructure
-from laneweave.protocol.vehicle.lane_ends import sections_to_lines
+from laneweave.protocol.vehicle.lane_ends import re_entry, sections_to_lines
 from laneweave.protocol.wire.messages import Census, OffLattice
 
 SORTING_M = 300.0
 """Length of road behind the line of a closed part in which a formation can sort its lanes."""
-QUEUE_M = 50.0
-"""Beginnings of queues are rounded down to multiples of this."""
+QUEUE_M = 10.0
+"""Lengths of queues before lines are rounded up to multiples of this."""
+LEFT_M = 1.0
+"""Length of a lane that is left behind the last part that a formation leaves to others, and minimum
+length of such a part."""
+
+
+class Overtaking(NamedTuple):
+    """Where a faster vehicle of another system overtakes a formation, which leaves its lane."""
+
+    lane: int
+    from_m: float
+    """Where the front of the formation is when all have left the lane."""
+    to_m: float
+    """Where its rear is when all have been overtaken."""
+    until_s: float
+    """Road time by which all have left the lane."""
+
+    @property
+    def closure(self) -> TemporaryClosure:
+        """The part of the lane that the formation does not use."""
+        return TemporaryClosure(self.lane, self.from_m, self.to_m)
 
 
 @frozen
@@ -60,6 +82,8 @@ class Stage:
     """Whether lanes are sorted in an earlier stage."""
     avoids: bool = False
     """Whether any lane that goes on will do, since vehicles sort in a later stage."""
+    until_s: float = math.inf
+    """Road time by which moves must have ended, since a vehicle overtakes the formation then."""
 
     @cached_property
     def open_sections(self) -> list[tuple[LaneSection, float]]:
@@ -134,8 +158,12 @@ WHOLE_ROAD = Stage(0.0, math.inf)
 """The stage of a formation for which none has been chosen."""
 
 
-@lru_cache(maxsize=64)
-def stages(scenario: Scenario, closed: tuple[TemporaryClosure, ...] = ()) -> tuple[Stage, ...]:
+@lru_cache(maxsize=256)
+def stages(
+    scenario: Scenario,
+    closed: tuple[TemporaryClosure, ...] = (),
+    overtaken: tuple[Overtaking, ...] = (),
+) -> tuple[Stage, ...]:
     """Return the stages of formations, from the start of the road to its end.
 
     Before a part that is closed for a time, vehicles change lanes from the start of the road on:
@@ -145,18 +173,26 @@ def stages(scenario: Scenario, closed: tuple[TemporaryClosure, ...] = ()) -> tup
     Args:
         scenario: road, structures.
         closed: parts that are closed for a time (`with_queues`).
+        overtaken: where others overtake the formation (`where_overtaken`). It may change lanes up
+            to their beginning: nobody stops there.
     """
     start_m, road_m = scenario.road.sorting_start_m, scenario.road.length_m
-    passed_m = max((one.to_m for one in closed), default=0.0)
+    avoided = (*closed, *(one.closure for one in overtaken))
+    until_s = {one.from_m: one.until_s for one in overtaken}
+    passed_m = max((one.to_m for one in avoided), default=0.0)
     structures = [one for one in scenario.formation.structures if one.from_m >= passed_m]
     formed_m = pairwise([*(one.from_m for one in structures), start_m])
-    sections = cut(scenario.geometry.sections, closed)
-    lines_m = [one.to_m for one in sections_to_lines(scenario, closed)]
+    sections = cut(scenario.geometry.sections, avoided)
+    no_line = {(one.lane, one.from_m) for one in overtaken}
+    lines_m = [
+        one.to_m if (one.lane, one.to_m) in no_line else to_line.to_m
+        for one, to_line in zip(sections, sections_to_lines(scenario, avoided), strict=True)
+    ]
     parts = [
         *((*each_m, one, False) for each_m, one in zip(formed_m, structures, strict=True)),
         *(
             (from_m, to_m, None, sudden and to_m <= max(start_m, road_m - SORTING_M))
-            for from_m, to_m, sudden in _sorting_stages(scenario, closed, sections, lines_m)
+            for from_m, to_m, sudden in _sorting_stages(scenario, avoided, sections, lines_m)
         ),
     ]
     parts.sort(key=itemgetter(0))
@@ -169,7 +205,8 @@ def stages(scenario: Scenario, closed: tuple[TemporaryClosure, ...] = ()) -> tup
             if one.to_m > from_m
         ]
         road, ends_m = zip(*ahead, strict=True)
-        made.append(Stage(from_m, to_m, structure, road, ends_m, avoids=avoids))
+        ends_s = until_s.get(to_m, math.inf)
+        made.append(Stage(from_m, to_m, structure, road, ends_m, avoids=avoids, until_s=ends_s))
     made = [stage for stage in made if stage.lanes]
     first = next(number for number, stage in enumerate(made) if stage.structure is None)
     return tuple(
@@ -216,6 +253,35 @@ def _sorting_stages(
         from_m = position_m
 
 
+def where_overtaken(
+    cleared: Iterable[ClearedPart], columns: range, scenario: Scenario
+) -> tuple[Overtaking, ...]:
+    """Return where faster vehicles of other systems overtake a formation.
+
+    Args:
+        cleared: what is cleared for them, at their speeds. It is a slot longer than they need,
+            which gives the rolling operation time to plan.
+        columns: columns of the formation.
+        scenario: lattice.
+    """
+    lattice, road_m, found = scenario.lattice, scenario.road.length_m, list[Overtaking]()
+    front, rear = columns[-1], columns[0]
+    for part in cleared:
+        gained_mps = part.speed_mps - lattice.speed_mps
+        if gained_mps <= 0.0:
+            continue
+        from_m, to_m = part.at(0.0)
+        rear_m = lattice.cell_s_m(rear, 0.0) - scenario.types.longest_body_m
+        until_s = (rear_m - to_m) / gained_mps + scenario.timing.cycles_s[0]
+        overtaken_s = (lattice.cell_s_m(front, 0.0) - from_m) / gained_mps
+        begins_m = lattice.cell_s_m(front, until_s)
+        ends_m = max(lattice.cell_s_m(rear, overtaken_s), begins_m + LEFT_M)
+        ends_m = min(ends_m, road_m - LEFT_M)
+        if ends_m > max(begins_m, 0.0):
+            found.append(Overtaking(part.lane, begins_m, ends_m, until_s))
+    return tuple(found)
+
+
 def shortest_m(scenario: Scenario) -> float:
     """Return the length of the shortest stage in which a formation can move."""
     return scenario.formation.longest_m + scenario.types.step_m
@@ -224,10 +290,11 @@ def shortest_m(scenario: Scenario) -> float:
 def with_queues(
     closed: Sequence[TemporaryClosure], census: Census, scenario: Scenario
 ) -> tuple[TemporaryClosure, ...]:
-    """Return parts that are closed for a time, with the vehicles that wait before them.
+    """Return parts that are closed for a time, so that their lines are before waiting vehicles.
 
-    Parts of different lanes begin together if no formation can move between them. The beginnings
-    of queues are rounded, since every new one makes formations plan again.
+    Those beyond the line do not move it. Parts of different lanes begin together if no formation
+    can move between them. The beginnings of queues are rounded, since every new one makes
+    formations plan again.
 
     Args:
         closed: parts that are closed for a time.
@@ -236,18 +303,19 @@ def with_queues(
     """
     if not closed:
         return ()  # as in nearly every tick
-    parts, longest_m = sorted(closed), scenario.types.longest_body_m
+    parts, room_m = sorted(closed), re_entry(scenario).room_m
     waiting = [body for body in census.off_lattice if _goes_on(body, scenario)]
     with_their_queues = list[TemporaryClosure]()
     for part in parts:
         passed_m = [one.to_m for one in parts if one.lane == part.lane and one.to_m <= part.from_m]
+        line_m = part.from_m - part.late_m - room_m
         queue_m = [
-            QUEUE_M * math.floor(body.rear_m / QUEUE_M)
+            line_m - body.rear_m
             for body in waiting
-            if body.lane == part.lane
-            and max(passed_m, default=-math.inf) <= body.rear_m < part.from_m - longest_m
+            if body.lane == part.lane and max(passed_m, default=-math.inf) <= body.rear_m < line_m
         ]
-        known = part._replace(from_m=min(queue_m), late_m=0.0) if queue_m else part
+        before_m = part.late_m + QUEUE_M * math.ceil(max(queue_m, default=0.0) / QUEUE_M)
+        known = part._replace(from_m=part.from_m - before_m, late_m=0.0) if queue_m else part
         with_their_queues.append(known)
     group_m, found = -math.inf, list[TemporaryClosure]()
     for part in sorted(with_their_queues, key=lambda part: part.from_m):

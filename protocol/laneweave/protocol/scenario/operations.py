@@ -36,6 +36,9 @@ class OperationTraits:
     """Speed at which a vehicle may close up to another if T_F is not given; None: v_F / 2."""
     accel_ratio: float
     """Peak acceleration of a minimum-jerk move, divided by the limit, if T_F is not given."""
+    clearing_slots: int
+    """Slots in which vehicles leave a lane that is cleared ahead of a fast vehicle as it enters:
+    plans, and vehicles that can leave it only after a neighbour has, take one each."""
     planner: str | None = None
     """Name of the operation's own planner; None: `formation.solver` is used."""
 
@@ -60,6 +63,7 @@ OPERATIONS: Mapping[str, OperationTraits] = MappingProxyType(
             # refuses a few scenarios more, and asks for a longer T_F.
             closing_mps=8.0,
             accel_ratio=1.3,
+            clearing_slots=4,  # formations settle first
         ),
         "rolling": OperationTraits(
             has_formations=False,
@@ -83,6 +87,7 @@ OPERATIONS: Mapping[str, OperationTraits] = MappingProxyType(
             common_slots=True,
             closing_mps=None,
             accel_ratio=1.2,
+            clearing_slots=3,
             planner=ROLLING_SOLVER,
         ),
     }

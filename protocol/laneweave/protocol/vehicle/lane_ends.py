@@ -71,6 +71,9 @@ TRACKING_SHARE = 0.9
 is kept for tracking errors."""
 HEEDED_BRAKING_MPS2 = 8.0
 """Deceleration up to which a vehicle brakes for a part of a lane that is closed suddenly."""
+SOON_S = 16.0
+"""Time before the line of a lane that has just been closed in which no vehicle should still enter
+it: it would need a new plan, for which others have to complete their moves, and another move."""
 NEAR_LINE_M = 1.0
 """Distance past a line at which a vehicle still stands at it."""
 CLEAR_M = 1.0
@@ -247,6 +250,11 @@ class LaneEnds:
                 ):
                     return True
         return False
+
+    def closed_soon(self, cell: Cell, t_s: float, soon_s: float = SOON_S) -> bool:
+        """Return whether the lane of a cell is closed for a time soon ahead of it."""
+        end = self.ahead(cell[1], self._lattice.cell_s_m(cell[0], t_s))
+        return end is not None and end.sudden and self._is_beyond(end, cell, t_s + soon_s)
 
     def _ends_changes(self, cell: Cell, t_s: float, body_m: float) -> bool:
         """Return whether a cell is where lane changes have ended before the exit of a section."""

@@ -50,6 +50,7 @@ LEFT_OFF_LANE: Final = "left-off-lane"
 LEFT_LATTICE: Final = "left-lattice"
 """Bridge: a vehicle has no cell any more, and stops before the end of its lane."""
 MISSED_EXIT: Final = "missed-exit"
+MOVE_TAKEN_BACK: Final = "move-taken-back"
 """Bridge: a vehicle has begun a move into or out of an exit lane too late, and holds its cell."""
 DRIVES_OUT: Final = "drives-out"
 """Bridge: a vehicle starts from the end of its lane into a gap in the neighbouring lane."""
@@ -114,6 +115,7 @@ FIELDS: Final[Mapping[str, tuple[str, ...]]] = {
     ),
     LEFT_LATTICE: ("vehicle", "lane"),
     MISSED_EXIT: ("vehicle", "lane"),
+    MOVE_TAKEN_BACK: ("vehicle", "lane"),
     DRIVES_OUT: ("vehicle", "lane"),
     ENTERED_LATTICE: ("vehicle", "lane"),
     PART_CLOSED: ("lane", "from_m", "to_m", "late_m", "cause", "vehicle", "since_s", "until_s"),

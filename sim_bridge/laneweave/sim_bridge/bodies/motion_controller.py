@@ -33,6 +33,7 @@ from laneweave.protocol.lattice import Cell, Lattice, footprint
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.vehicle_tables import Vehicle
 from laneweave.protocol.vehicle.emergency_brake import EmergencyBrake
+from laneweave.protocol.vehicle.lane_ends import LATE_S
 from laneweave.protocol.vehicle.motion import (
     ARRIVED_ACROSS_M,
     DISPLACED_ALONG_M,
@@ -50,12 +51,7 @@ from laneweave.protocol.vehicle.motion import (
     stop_law,
 )
 from laneweave.protocol.vehicle.territory import territory_of
-from laneweave.protocol.wire.messages import (
-    Command,
-    CurrentMotion,
-    Neighbour,
-    VehicleRecord,
-)
+from laneweave.protocol.wire.messages import Command, CurrentMotion, Neighbour, VehicleRecord
 from laneweave.sim_bridge.bodies.cell_guard import CellGuard
 from laneweave.sim_bridge.bodies.command_checks import (
     NEIGHBOURING,
@@ -198,12 +194,13 @@ class MotionController:
         leaves = self.off_lattice is OffLatticePhase.RE_ENTERING and self.stop_lines.passed
         stays_free = self.store.territory.given_up_cells_stay_free
         first, last = self.lattice.lanes_touched(self.measured[3], self._limits.width_m)
-        drives = self.measured[1] > STANDING_MPS
-        if drives and (leaves or (not stays_free and first != last)):
+        if self.measured[1] > STANDING_MPS and (leaves or (not stays_free and first != last)):
             return False  # one that leaves its lane stands if the other one is closed meanwhile
         # Behind an exit the lane may belong to a ramp, to whose end the body does not come.
         cell = self.hold_cell if leaves else (self.hold_cell[0], self._body_lane)
         body_m = self.stop_lines.section_m(cell[1], self.measured[0])
+        if not stays_free and self.off_lattice is None and first == last == self.hold_cell[1]:
+            t_s += self._scenario.timing.cycles_s[0] - LATE_S  # no move can lead it out any more
         return self.stop_lines.lane_ends.has_passed(cell, t_s, body_m=body_m)
 
     @property
@@ -225,18 +222,18 @@ class MotionController:
         ends, lane = self.stop_lines.lane_ends, self._body_lane_for(goal[1])
         return lane != goal[1] and ends.too_late((goal[0], lane), goal, t_s)
 
-    def return_to_origin(self, t_s: float) -> bool:
+    def return_to_origin(self) -> bool:
         """Hold the cell in which the move began; return False if the vehicle may not.
 
         It may until a later plan takes the cell, which no vehicle that moves takes part in. In a
-        formation, no other vehicle is led into the cell before the move is complete. Commands for
-        earlier ticks, which may repeat the move, are no longer accepted.
+        formation, no other vehicle is led into the cell before the move is complete. The process in
+        charge may repeat the move until it learns of this; these commands are not accepted.
         """
         origin = self.motion.origin
         if origin[1] != self._body_lane or not self.store.territory.may_hold(self.record, origin):
             return False
+        self.stop_lines.taken_back = self.hold_cell
         self._guard.moving_from, self.hold_cell = self.hold_cell, origin
-        self.command_tick = max(self.command_tick, round(t_s / self.tick_s) - 1)
         self._stop_motion()
         return True
 
@@ -258,11 +255,11 @@ class MotionController:
         self.store.give_up_cells()
         self._stop_motion()
 
-    def re_enter(self, cell: Cell) -> None:
-        """Start from standing towards a cell that is kept free, of this or a neighbouring lane."""
+    def re_enter(self, cell: Cell, open_lanes: Iterable[int]) -> None:
+        """Start from standing towards a cell that is kept free (`StopLinesAhead.start`)."""
         self.off_lattice, self.hold_cell = OffLatticePhase.RE_ENTERING, cell
         self.broken_mps2, self.stays = None, False
-        self.stop_lines.start(cell[1], self._body_lane, self.measured[0])
+        self.stop_lines.start(cell[1], open_lanes, self.measured[0])
         self._stop_motion()
 
     def enter_lattice(self, cells: Iterable[Cell]) -> None:
@@ -302,12 +299,14 @@ class MotionController:
             self.refusal = Refusal(Problem.VALUES)
             raise
         leaves = command.hold_cell != self.hold_cell
-        if self.off_lattice is not None and (leaves or len(jerks) > 0):
+        repeats = leaves and command.hold_cell == self.stop_lines.taken_back
+        if repeats or (self.off_lattice is not None and (leaves or len(jerks) > 0)):
             return False
         if incarnation > in_charge:
             if leaves:
                 return False
             self.store.put_in_charge(incarnation)
+            self.stop_lines.taken_back = None
         self.command_tick = command.tick
         self.store_requests(command)
         t_s = command.tick * self.tick_s

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from attrs import Factory, define
+from attrs import Factory, define, field
 
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario.fields import Scenario
@@ -33,8 +33,10 @@ class StopLinesAhead:
     """Whether the vehicle has started from standing at a stop line."""
     _kept_out_of: Cell | None = None
     """Cell in a lane that has ended, which the body may not enter; see `keep_out`."""
-    _past: LaneEnd | None = None
-    """Beginning of a part of its lane that is open again: it has started there, and passes it."""
+    taken_back: Cell | None = None
+    """Target of a move that was taken back, which its process may repeat until it learns of it."""
+    _past: dict[int, LaneEnd] = field(factory=dict)
+    """Beginnings of parts that are open again, by lane: it has started there, and passes them."""
 
     def keep_out(
         self,
@@ -70,17 +72,24 @@ class StopLinesAhead:
         self._kept_out_of = hold_cell if kept_out else None
         return kept_out
 
-    def start(self, goal: int, lane: int, s_m: float) -> None:
-        """Start from standing towards a lane, from a position in another or the same one."""
-        end = self.lane_ends.ahead(lane, s_m)
+    def start(self, goal: int, open_lanes: Iterable[int], s_m: float) -> None:
+        """Start from standing towards a lane.
+
+        Args:
+            goal: the lane.
+            open_lanes: lanes that the body touches in which it may drive past the next dead end.
+            s_m: position of the body.
+        """
         self.passed = True
-        if end is not None and end.sudden and (goal == lane or s_m > end.line_m + NEAR_LINE_M):
-            self._past = end
+        for lane in open_lanes:
+            end = self.lane_ends.ahead(lane, s_m)
+            if end is not None and end.sudden and (goal == lane or s_m > end.line_m + NEAR_LINE_M):
+                self._past[lane] = end
 
     def section_m(self, lane: int, s_m: float) -> float:
         """Return a position in the section of a lane whose end counts for a body there."""
-        past = self._past
-        return s_m if past is None or past.lane != lane else max(s_m, past.reopens_m)
+        past = self._past.get(lane)
+        return s_m if past is None else max(s_m, past.reopens_m)
 
     def allow(self, command: Command, t_s: float) -> bool:
         """Return whether a move may begin: in time in both lanes, and into no cleared part."""
@@ -108,10 +117,11 @@ class StopLinesAhead:
         """
         s_m, speed_mps, goal = measured[0], measured[1], hold_cell[1]
         first, last = self._scenario.lattice.lanes_touched(measured[3], self._limits.width_m)
-        if self._past is not None and not (
-            first <= self._past.lane <= last and s_m < self._past.reopens_m
-        ):
-            self._past = None
+        self._past = {
+            lane: end
+            for lane, end in self._past.items()
+            if first <= lane <= last and s_m < end.reopens_m
+        }
         in_lane_m = {lane: self.section_m(lane, s_m) for lane in range(first, last + 1)}
         if goal not in in_lane_m and enters:
             # The lane may open ahead, behind the end of another section.

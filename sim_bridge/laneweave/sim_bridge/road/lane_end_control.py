@@ -18,12 +18,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from attrs import define, frozen
 
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.road_layout import (
-    NO_PARTS,
-    LanePosition,
-    LaneSection,
-    TemporaryClosure,
-)
+from laneweave.protocol.road_layout import NO_PARTS, LanePosition, LaneSection, TemporaryClosure
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.lane_end import LaneEnd
 from laneweave.protocol.vehicle.lane_ends import (
@@ -78,7 +73,7 @@ class LaneEndChange:
 
     vehicle: Name
     kind: str
-    """`LEFT_LATTICE`, `DRIVES_OUT`, `ENTERED_LATTICE` or `MISSED_EXIT`."""
+    """`LEFT_LATTICE`, `DRIVES_OUT`, `ENTERED_LATTICE`, `MISSED_EXIT` or `MOVE_TAKEN_BACK`."""
     lane: int
 
 
@@ -200,7 +195,7 @@ class LaneEndControl:
         """Take a vehicle off the lattice, or back into its own lane, where a lane has ended."""
         controller = vehicle.controller
         missed = controller.has_missed_exit(t_s)
-        if missed and controller.return_to_origin(t_s):
+        if missed and controller.return_to_origin():
             yield LaneEndChange(name, MISSED_EXIT, controller.hold_cell[1])
         elif (missed and self._cells_stay_free) or controller.has_lost_cell(t_s):
             # While it re-enters, a vehicle may come to another dead end.
@@ -316,6 +311,11 @@ class LaneEndControl:
                 for part in self.still_closed(at_s)
             )
         )
+
+    def _open_lanes(self, vehicle: RoadVehicle, at_s: float) -> list[int]:
+        """Return the lanes of a body in which it can drive on beyond the next dead end."""
+        ahead = {lane: self._end_ahead(lane, vehicle.state[0]) for lane in vehicle.lanes_used}
+        return [lane for lane, at in ahead.items() if at and self._is_open(at, vehicle, at_s)]
 
     def _later(self, at: LanePosition, vehicle: RoadVehicle) -> Iterator[LaneEnd]:
         """Yield the dead ends of a lane after one of them, ahead of a body."""
@@ -452,7 +452,8 @@ class LaneEndControl:
                 # Weak types need more columns than strong ones, which arrive earlier.
                 limits = self._scenario.types[vehicle.arrival.vehicle_type].limits
                 own = own_re_entry(self._scenario, limits)
-                vehicle.controller.re_enter((gap.columns[-own.columns], gap.lane))
+                cell = gap.columns[-own.columns], gap.lane
+                vehicle.controller.re_enter(cell, self._open_lanes(vehicle, t_s))
                 yield LaneEndChange(vehicle.name, DRIVES_OUT, gap.lane)
                 return
 

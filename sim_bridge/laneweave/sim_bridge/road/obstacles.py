@@ -201,7 +201,7 @@ class Obstacles:
             elif (vehicle := self._found(cause, vehicles, t_s)) is not None:
                 self._pending.remove(cause)
                 others = {name: one for name, one in vehicles.items() if one is not vehicle}
-                part = self._with_room(self._part_of(vehicle, cause.decel_mps2), others)
+                part = self._with_room(self._part_of(vehicle, cause.decel_mps2, others), others)
                 obstacle = ActiveObstacle(
                     BREAKDOWN, part, t_s, breakdown=cause, vehicle=vehicle.name
                 )
@@ -268,17 +268,37 @@ class Obstacles:
             one.stands, one.until_s = True, t_s + one.breakdown.for_s
             to_m = self._end_m(one.part.lane, vehicle.state[0])
             one.part = one.part._replace(to_m=to_m)
+        elif not one.stands and vehicle.state[0] > one.part.to_m - AHEAD_M:
+            to_m = self._stops_m(vehicle, one.breakdown.decel_mps2, vehicles)
+            one.part = one.part._replace(to_m=max(to_m, one.part.to_m))
 
-    def _part_of(self, vehicle: RoadVehicle, decel_mps2: float) -> TemporaryClosure:
+    def _part_of(
+        self, vehicle: RoadVehicle, decel_mps2: float, vehicles: Mapping[Name, RoadVehicle]
+    ) -> TemporaryClosure:
         """Return the part of a lane that a vehicle blocks while it slows down.
 
         It begins where the front is now, or where the rear will be if the vehicle brakes in less
-        than its length, and ends before vehicles ahead; once it stands, in front of it.
+        than its length, and ends where the front will be, or before vehicles ahead until they have
+        driven on (`_follow`).
         """
         s_m, speed_mps = vehicle.state[:2]
-        lane, brakes_m = vehicle.cell[1], speed_mps**2 / (2.0 * decel_mps2)
+        brakes_m = speed_mps**2 / (2.0 * decel_mps2)
         from_m = s_m + min(0.0, brakes_m - vehicle.size[0])
-        return TemporaryClosure(lane, from_m, self._end_m(lane, s_m))
+        to_m = self._stops_m(vehicle, decel_mps2, vehicles)
+        return TemporaryClosure(vehicle.cell[1], from_m, to_m)
+
+    def _stops_m(
+        self, vehicle: RoadVehicle, decel_mps2: float, vehicles: Mapping[Name, RoadVehicle]
+    ) -> float:
+        """Return where the part of a vehicle ends that slows down, before vehicles ahead."""
+        (s_m, speed_mps), lane = vehicle.state[:2], vehicle.cell[1]
+        rears_m = (
+            one.state[0] - one.size[0] - 2.0 * AHEAD_M
+            for one in vehicles.values()
+            if lane in one.lanes_used and one.state[0] > s_m
+        )
+        stops_m = min([s_m + speed_mps**2 / (2.0 * decel_mps2), *rears_m])
+        return self._end_m(lane, max(s_m, stops_m))
 
     def _with_room(
         self, part: TemporaryClosure, vehicles: Mapping[Name, RoadVehicle]

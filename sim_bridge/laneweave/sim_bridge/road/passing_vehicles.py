@@ -294,8 +294,8 @@ class PassingVehicles:
             found = vehicles_in_part(self._scenario, lane, from_m, to_m, vehicles.values())
             if not found.allow_closing(waits=waits):
                 return False
-        # A slot may pass before a plan, and some can leave the lane only after a neighbour has.
-        free_m = to_m + (self._cleared_ahead_m(passage, 3) if waits and fast else 0.0)
+        slots = self._scenario.formation.traits.clearing_slots
+        free_m = to_m + (self._cleared_ahead_m(passage, slots) if waits and fast else 0.0)
         for vehicle in vehicles.values():
             s_m, speed_mps = vehicle.state[:2]
             if lane not in vehicle.lanes_used:
@@ -325,7 +325,9 @@ class PassingVehicles:
         """Return what is cleared for a vehicle that waits for room to enter."""
         from_m, to_m = passage.from_m, passage.to_m
         if self.is_fast(passage):
-            to_m += self._cleared_ahead_m(passage, 2)
+            # Where it may enter, some others are still allowed to change into its lane.
+            slots = self._scenario.formation.traits.clearing_slots - 1
+            to_m += self._cleared_ahead_m(passage, slots)
         else:
             from_m -= cleared_before_m(self._scenario)
         return Cleared(passage.lane, from_m, to_m, 0.0, t_s, PASSING)

@@ -12,7 +12,7 @@ from laneweave.protocol.runtime.node import Effect
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.emergency_brake import EmergencyBrake
 from laneweave.protocol.vehicle.lane_ends import LaneEnds
-from laneweave.protocol.wire.events import PART_CLOSED, PART_OPENED
+from laneweave.protocol.wire.events import MOVE_TAKEN_BACK, PART_CLOSED, PART_OPENED
 from laneweave.protocol.wire.messages import ClosedFormation, Name, Neighbour
 from laneweave.protocol.wire.obstacle_messages import Obstacle
 from laneweave.sim_bridge.road.allocation import NO_VEHICLES, Allocation, allocation_of
@@ -223,7 +223,8 @@ class Roadside:
             self.publisher.on_changed()
             self._meter.most_in_column = self._lanes_past(closed)
             for vehicle in vehicles.values():
-                vehicle.close(self.lane_ends)
+                if vehicle.close(self.lane_ends, t_s):
+                    yield LaneEndChange(vehicle.name, MOVE_TAKEN_BACK, vehicle.cell[1])
             control.close(self.lane_ends)
         self.publisher.obstacles, self.publisher.cleared = obstacles.parts, obstacles.cleared
         for vehicle in broken:

@@ -146,9 +146,24 @@ class RoadVehicle:
         """Number of the block in which the vehicle entered."""
         return self.controller.lattice.block_of(self.admission.cell[0])
 
-    def close(self, lane_ends: LaneEnds) -> None:
-        """Replace the ends of lanes: parts of lanes are closed for a time, or open again."""
-        self.controller.stop_lines.lane_ends = lane_ends
+    def close(self, lane_ends: LaneEnds, t_s: float) -> bool:
+        """Replace the ends of lanes; return whether the vehicle takes back a move.
+
+        Parts of lanes are closed for a time, or open again. In a formation, a vehicle that has just
+        begun to move into such a lane returns to its own. In the rolling operation it takes part in
+        the plan that replaces that of the slot.
+        """
+        controller, lines = self.controller, self.controller.stop_lines
+        before, lines.lane_ends = lines.lane_ends, lane_ends
+        target = controller.hold_cell
+        return (
+            self.has_cell
+            and not controller.store.territory.given_up_cells_stay_free
+            and controller.motion.origin[1] != target[1]
+            and lane_ends.closed_soon(target, t_s)
+            and not before.closed_soon(target, t_s)
+            and controller.return_to_origin()
+        )
 
     def join(self, closed: ClosedFormation) -> None:
         """Join a closed formation: plans must cover all of its blocks."""

@@ -27,13 +27,25 @@ def part(from_m: float, to_m: float, lane: int = 1) -> TemporaryParts:
     return TemporaryParts((TemporaryClosure(lane, from_m, to_m),))
 
 
+def time_at(rear_m: float) -> float:
+    """Return the road time at which the rear of the formation is at a position."""
+    return LATTICE.passing_time_s(LATTICE.block_range(BLOCKS[-1])[0], rear_m)
+
+
+def fast(behind_m: float, speed_mps: float = 25.0) -> TemporaryParts:
+    """Return what is cleared for a vehicle at a distance from a formation at 100 m."""
+    to_m = 100.0 - behind_m
+    part = ClearedPart(1, to_m - 140.0, to_m, speed_mps, time_at(100.0))
+    return TemporaryParts((), (part,))
+
+
 class Leading:
     """An operation that leads one formation, whose plan is in force."""
 
     def __init__(self, rear_m: float, known: TemporaryParts) -> None:
         """Begin with a formation of two vehicles that ends at a position."""
         column = LATTICE.block_range(BLOCKS[-1])[0]
-        self.t_s = LATTICE.passing_time_s(column, rear_m)
+        self.t_s = time_at(rear_m)
         numbers = count(1)
         self.operation = FormationsOperation(
             SCENARIO,
@@ -79,8 +91,12 @@ PLANS_AGAIN, KEEPS_ITS_PLAN = BallotPhase.PREPARING, BallotPhase.IN_FORCE
         (100.0, part(600.0, 620.0), NOTHING, PLANS_AGAIN),
         # About to be closed.
         (100.0, NOTHING, TemporaryParts((), (ClearedPart(1, 600.0, 620.0),)), PLANS_AGAIN),
-        # Only moving vehicles of other systems are there.
-        (100.0, NOTHING, TemporaryParts((), (ClearedPart(1, 0.0, 90.0, 25.0),)), KEEPS_ITS_PLAN),
+        # A fast vehicle will overtake it, has overtaken it, or is too slow for this.
+        (100.0, NOTHING, fast(50.0), PLANS_AGAIN),
+        (100.0, fast(50.0), NOTHING, PLANS_AGAIN),
+        (100.0, NOTHING, fast(-300.0), KEEPS_ITS_PLAN),
+        (100.0, NOTHING, fast(50.0, 15.5), KEEPS_ITS_PLAN),
+        (100.0, NOTHING, fast(50.0, 10.0), KEEPS_ITS_PLAN),
         # It has passed the part, in S3 and before.
         (615.0, NOTHING, part(500.0, 520.0), KEEPS_ITS_PLAN),
         (615.0, part(500.0, 520.0), NOTHING, KEEPS_ITS_PLAN),

@@ -584,17 +584,23 @@ def test_states_of_vehicles_that_left_are_forgotten(reach: Reach) -> None:
     leader.on_members(formation(A), 1.0)
     hear(leader, state(B, OTHERS._replace(term=9), t_s=2.0))
     assert set(leader.states) == {A}
-    if reach is watching:
-        assert (leader.phase, leader.ballot) == (BallotPhase.IN_FORCE, ballot)
-    else:
-        assert prepares_anew(leader, ballot)
+    assert prepares_anew(leader, ballot)
+
+
+def test_l8_one_that_leaves_before_it_has_completed_the_plan_keeps_others_waiting() -> None:
+    """It has stopped where its lane is closed: it does not accept, or complete its moves."""
+    for done in (True, False):
+        leader, ballot = watching(A, B)
+        hear(leader, state(B, ballot, (0, 1), accepted=True, done=done, t_s=1.0))
+        leader.on_members(formation(A), 1.0)
+        assert prepares_anew(leader, ballot) is not done
 
 
 def test_a_member_out_of_reach_is_planned_again_when_another_one_has_left() -> None:
     """The cell of that one is free now."""
     leader, ballot = planning(A, B)
     leader.on_plan(plan_of(leader), 0.0, [A])
-    hear(leader, *(state(name, ballot, accepted=True) for name in (A, B)))
+    hear(leader, *(state(name, ballot, accepted=True, done=name == B) for name in (A, B)))
     hear(leader, astray(t_s=1.0))
     assert phase(leader) is BallotPhase.IN_FORCE
     leader.on_members(formation(A), 1.0)
@@ -659,10 +665,11 @@ def run_random_history(leader: FormationLeader, rng: random.Random) -> int:
         )
         leader.on_state(each, now_s)
         if rng.random() < 0.05:
-            leader.on_members(formation(A, B, lane=rng.choice((1, 2))), now_s)
+            names = rng.choice(((A, B), (A, B), (A,)))
+            leader.on_members(formation(*names, lane=rng.choice((1, 2))), now_s)
         leader.take(TIME, now_s)
         if leader.take(PROMISED, now_s):
-            assert set(leader.hold_cells) == {A, B}
+            assert set(leader.hold_cells) == set(leader.formation.roster)
             if rng.random() < 0.7:
                 leader.on_plan(plan_of(leader), now_s)
             else:

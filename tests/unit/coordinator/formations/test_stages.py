@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from itertools import pairwise
 
 import pytest
 from attrs import evolve
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from laneweave.coordinator.formations.roster import (
@@ -18,8 +19,15 @@ from laneweave.coordinator.formations.roster import (
     stage_begin_s,
     stage_end_s,
 )
-from laneweave.coordinator.formations.stages import Stage, stages, with_queues
-from laneweave.protocol.road_layout import ANY_LANE, TemporaryClosure
+from laneweave.coordinator.formations.stages import (
+    LEFT_M,
+    Overtaking,
+    Stage,
+    stages,
+    where_overtaken,
+    with_queues,
+)
+from laneweave.protocol.road_layout import ANY_LANE, ClearedPart, TemporaryClosure
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.formation_table import DrivingStructure, FormationSettings
 from laneweave.protocol.scenario.road_tables import Closure, Entrance, Exit, Road
@@ -216,6 +224,67 @@ def test_structures_are_formed_only_behind_closed_parts() -> None:
     assert [one.sorted_before for one in (around, formed, sorting)] == [False, True, True]
 
 
+# --- faster vehicles of other systems ---------------------------------------------------------
+
+COLUMNS = range(-20, -14)
+
+
+@given(
+    speed_mps=st.floats(15.5, 50.0),
+    rear_m=st.floats(0.0, 600.0),
+    length_m=st.floats(50.0, 300.0),
+    share=st.floats(0.0, 1.0),
+)
+def test_a_formation_is_out_of_a_lane_while_a_vehicle_overtakes_it(
+    speed_mps: float, rear_m: float, length_m: float, share: float
+) -> None:
+    scenario = Scenario(road=Road(s3_m=19_000.0))
+    lattice, slot_s = scenario.lattice, scenario.timing.cycles_s[0]
+    t_s = lattice.passing_time_s(COLUMNS[0], rear_m)
+    part = ClearedPart(1, rear_m - 20.0 - length_m, rear_m - 20.0, speed_mps, t_s)
+    overtaken = where_overtaken((part,), COLUMNS, scenario)
+    assume(overtaken)  # before the end of the road
+    (found,) = overtaken
+    # What a vehicle needs, without the slot for planning, reaches no body before.
+    gained_mps = speed_mps - lattice.speed_mps
+    rear_then_m = lattice.cell_s_m(COLUMNS[0], found.until_s) - scenario.types.longest_body_m
+    needed_m = part.at(found.until_s)[1] - slot_s * gained_mps
+    assert needed_m == pytest.approx(rear_then_m, abs=1e-3)
+    # While it overtakes, all cells are where the formation leaves the lane.
+    passed_s = found.until_s + (length_m - slot_s * gained_mps) / gained_mps
+    during_s = found.until_s + share * max(passed_s - found.until_s, 0.0)
+    for column in COLUMNS:
+        s_m = lattice.cell_s_m(column, during_s)
+        begin_m, end_m = part.at(during_s)
+        if begin_m < s_m and s_m - scenario.types.longest_body_m < end_m - slot_s * gained_mps:
+            assert lattice.cell_s_m(COLUMNS[-1], during_s) >= found.from_m - 1e-3
+            assert lattice.cell_s_m(COLUMNS[0], during_s) <= found.to_m + 1e-3
+
+
+def test_before_a_vehicle_overtakes_vehicles_leave_its_lane_and_sort_afterwards() -> None:
+    scenario, numbers = Scenario(), (0,)
+    overtaking = Overtaking(1, 300.0, 500.0, 40.0)
+    around, sorting = stages(scenario, (), (overtaking,))
+    # Nobody stops: the lane is used up to the beginning.
+    assert (around.from_m, around.to_m, around.until_s) == (0.0, 300.0, 40.0)
+    assert (lanes(around), around.avoids) == (([0, 1, 2], [1]), True)
+    assert (sorting.from_m, sorting.until_s) == (500.0, math.inf)
+    assert [sorting.goal_lanes(lane) for lane in range(3)] == [{0}, {1}, {2}]
+    # All are out of it at one time, wherever their cells are.
+    for cell in ((0, 1), (-10, 1)):
+        assert moves_end_s([cell], numbers, around, scenario) <= 40.0
+    assert moves_end_s([(0, 1)], numbers, evolve(around, until_s=1.0), scenario) == 1.0
+
+
+def test_a_vehicle_that_overtakes_at_the_end_of_the_road_leaves_a_lane_to_its_end() -> None:
+    scenario = Scenario()
+    part = ClearedPart(2, 420.0, 560.0, 25.0, scenario.lattice.passing_time_s(-14, 650.0))
+    (found,) = where_overtaken((part,), range(-14, -8), scenario)
+    assert found.from_m < scenario.road.length_m - LEFT_M == found.to_m
+    around = stages(scenario, (), (found,))[0]
+    assert around.goal_lanes(2) == {1}
+
+
 def waiting(*bodies: tuple[int, float]) -> Census:
     """Return a census of vehicles without cells, each given by its lane and its rear."""
     entries = (
@@ -228,9 +297,18 @@ def waiting(*bodies: tuple[int, float]) -> Census:
 def test_a_lane_is_closed_from_its_queue_on() -> None:
     scenario = Scenario()
     assert with_queues((PART,), waiting(), scenario) == (PART,)
-    # Vehicles in the part, and in other lanes, do not wait for it.
-    before = with_queues((PART,), waiting((1, 283.0), (1, 276.0), (1, 305.0)), scenario)
-    assert before == (TemporaryClosure(1, 250.0, 320.0),)
+    line_m = PART.from_m - ROOM_M
+    # Vehicles in the part, beyond its line, and in other lanes do not wait at the line.
+    passed = waiting((1, 305.0), (1, 283.0), (1, line_m), (2, line_m - 5.0))
+    assert with_queues((PART,), passed, scenario) == (PART,)
+    for queue_m, length_m in ((5.0, 10.0), (22.0, 30.0)):
+        queue = waiting((1, line_m - 5.0), (1, line_m - queue_m))
+        before = PART._replace(from_m=PART.from_m - length_m)
+        assert with_queues((PART,), queue, scenario) == (before,)
+    late = PART._replace(late_m=40.0)
+    assert with_queues((late,), waiting((1, line_m - 5.0)), scenario) == (late,)
+    longer = with_queues((late,), waiting((1, line_m - 55.0)), scenario)
+    assert longer == (PART._replace(from_m=PART.from_m - 60.0),)
     assert with_queues((), waiting((1, 283.0)), scenario) == ()
     # A queue before the end of a lane of the road has nothing to do with a part behind it.
     behind = TemporaryClosure(0, 850.0, 870.0)

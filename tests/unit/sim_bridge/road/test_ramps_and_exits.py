@@ -223,7 +223,7 @@ def change_at(moves: float) -> Command:
 def test_a_lane_change_that_begins_too_late_for_the_exit_is_taken_back() -> None:
     controller, t_s = changing(late=True)
     assert controller.has_missed_exit(t_s)
-    assert controller.return_to_origin(t_s)
+    assert controller.return_to_origin()
     assert controller.hold_cell == (0, 1)
     assert not controller.has_missed_exit(t_s)
 
@@ -242,9 +242,9 @@ def test_one_that_begins_in_time_is_not() -> None:
 
 
 def test_a_vehicle_does_not_return_to_a_cell_that_it_does_not_own() -> None:
-    controller, t_s = changing(late=True)
+    controller, _ = changing(late=True)
     set_record(controller.store, owned=((0, 0),))
-    assert not controller.return_to_origin(t_s)
+    assert not controller.return_to_origin()
     assert controller.hold_cell == (0, 0)
 
 

@@ -90,6 +90,7 @@ FOUND = (
     305,
     338,
     459,
+    1249,
 )
 """Seeds at which vehicles were in closed parts or waited for ever, before this was mended."""
 

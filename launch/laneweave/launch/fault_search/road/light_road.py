@@ -21,7 +21,13 @@ from laneweave.protocol.runtime.transport import LinkUp
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.lane_ends import LaneEnds
 from laneweave.protocol.vehicle.sudden_stops import stopping_m
-from laneweave.protocol.wire.events import DRIVES_OUT, ENTERED_LATTICE, LEFT_LATTICE, MISSED_EXIT
+from laneweave.protocol.wire.events import (
+    DRIVES_OUT,
+    ENTERED_LATTICE,
+    LEFT_LATTICE,
+    MISSED_EXIT,
+    MOVE_TAKEN_BACK,
+)
 from laneweave.protocol.wire.messages import ClosedFormation, Command, Name, Plan, Prepare, Sense
 from laneweave.protocol.wire.obstacle_messages import Obstacle
 from laneweave.sim_bridge.bodies.command_checks import Refusal
@@ -238,7 +244,7 @@ class LightRoad:
         """Let a body stop before the end of its lane, and come back; see `LaneEndControl`."""
         one, now_s = self.vehicles[vehicle], self.began_s + t_s
         body, cell = one.body, one.cell
-        if kind == MISSED_EXIT:
+        if kind in {MISSED_EXIT, MOVE_TAKEN_BACK}:
             self._checker.give_up_move(now_s, vehicle, cell)
             body.go(cell, t_s, self._scenario.runtime.tick_s)
         elif kind == LEFT_LATTICE:
