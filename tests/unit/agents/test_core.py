@@ -310,7 +310,7 @@ def test_it_begins_anew_when_its_move_into_a_closed_lane_is_taken_back(knows: bo
         rig.coast(1)
         assert repeats <= MAX_REPEATS + 2
     assert (repeats == 0) is knows
-    # With a new plan it may move there, if it arrives before the line: if it has waited, it is late.
+    # With a new plan it may move there, unless it has waited so long that it is too late.
     state = rig.run(30)
     assert (state.hold_cell, state.moving) == (HOME, False)
     if knows:
