@@ -319,17 +319,28 @@ def test_it_begins_anew_when_its_move_into_a_closed_lane_is_taken_back(knows: bo
         assert rig.controller.hold_cell == target
 
 
-@pytest.mark.parametrize(("ahead_m", "back"), [(150.0, True), (450.0, False), (20.0, False)])
+@pytest.mark.parametrize(
+    ("ahead_m", "ticks", "back"),
+    [
+        (150.0, 0, True),
+        (60.0, 0, True),
+        (450.0, 0, False),
+        # The body is in both lanes, and would be at the line.
+        (150.0, 20, True),
+        (100.0, 20, False),
+        # It has left its lane.
+        (150.0, 37, False),
+    ],
+)
 def test_only_moves_into_lanes_that_are_closed_soon_are_taken_back(
-    ahead_m: float, back: bool
+    ahead_m: float, ticks: int, back: bool
 ) -> None:
     rig = up_and_running()
     rig.accept((0, HOME, (HOME[0], 2)))
     while rig.controller.hold_cell == HOME:
         rig.answer()
-    if ahead_m < 100.0:
-        ahead_m = 150.0
-        rig.run(20)  # the body is in the other lane
+    if ticks:
+        rig.run(ticks)
     near_m = rig.state[0] + ahead_m
     parts = TemporaryParts((TemporaryClosure(2, near_m, near_m + 10.0),))
     assert rig.vehicle.close(LaneEnds(SCENARIO, parts), rig.tick * TICK_S) is back

@@ -230,7 +230,8 @@ class MotionController:
         charge may repeat the move until it learns of this; these commands are not accepted.
         """
         origin = self.motion.origin
-        if origin[1] != self._body_lane or not self.store.territory.may_hold(self.record, origin):
+        touched = origin[1] == self._body_lane_for(origin[1])
+        if not touched or not self.store.territory.may_hold(self.record, origin):
             return False
         self.stop_lines.taken_back = self.hold_cell
         self._guard.moving_from, self.hold_cell = self.hold_cell, origin

@@ -30,6 +30,10 @@ NEAR_M = 0.01
 """Distance from its cell up to which an entering vehicle need not settle."""
 
 
+RETURN_S = 4.5
+"""Time after which a body that is in two lanes is surely back in its own."""
+
+
 @define
 class RoadVehicle:
     """Body, motion controller and sensors of one vehicle."""
@@ -149,19 +153,21 @@ class RoadVehicle:
     def close(self, lane_ends: LaneEnds, t_s: float) -> bool:
         """Replace the ends of lanes; return whether the vehicle takes back a move.
 
-        Parts of lanes are closed for a time, or open again. In a formation, a vehicle that has just
-        begun to move into such a lane returns to its own. In the rolling operation it takes part in
-        the plan that replaces that of the slot.
+        Parts of lanes are closed for a time, or open again. In a formation, a vehicle that moves
+        into such a lane returns to its own, unless it has left it, or would still be in both at the
+        line. In the rolling operation it takes part in the plan that replaces that of the slot.
         """
         controller, lines = self.controller, self.controller.stop_lines
         before, lines.lane_ends = lines.lane_ends, lane_ends
         target = controller.hold_cell
+        in_both = target[1] in self.lanes_touched
         return (
             self.has_cell
             and not controller.store.territory.given_up_cells_stay_free
             and controller.motion.origin[1] != target[1]
             and lane_ends.closed_soon(target, t_s)
             and not before.closed_soon(target, t_s)
+            and not (in_both and lane_ends.closed_soon(target, t_s, RETURN_S))
             and controller.return_to_origin()
         )
 
