@@ -301,16 +301,13 @@ class AgentCore:
         execution, (begin_tick, known) = self.execution, self._begun_with
         if execution is None:
             return False
-        begins = self._begun is not None and sense.hold_cell != execution.hold_cell
-        if begins and sense.tick > begin_tick + MAX_REPEATS:
+        if sense.hold_cell == execution.hold_cell:
+            # An open gate for a move that can no longer begin would keep leaders waiting.
+            return bool(self._lane_ends) and execution.stuck
+        if self._begun is None or sense.tick > begin_tick + MAX_REPEATS:
             return True
         if not self._lane_ends:
             return False
-        if sense.hold_cell == execution.hold_cell:
-            # An open gate for a move that can no longer begin would keep leaders waiting.
-            return execution.stuck
-        if self._begun is None:
-            return True
         (_, origin, target), _ = self._begun
         # The motion controller refuses a whole move into a part that is closed or cleared.
         slot_s = execution.plan.slot_s if self._temporary and execution.plan is not None else None

@@ -289,9 +289,9 @@ def test_it_begins_anew_if_its_vehicle_has_entered_the_lattice_again_unseen() ->
     assert rig.shown[-1].hold_cell == there
 
 
-@pytest.mark.parametrize("knows", [True, False])
-def test_it_begins_anew_when_its_move_into_a_closed_lane_is_taken_back(knows: bool) -> None:
-    """At once if it knows the part; else its commands have no effect for some ticks."""
+@pytest.mark.parametrize("knows", ["the part", "that it has not begun the move", ""])
+def test_it_begins_anew_when_its_move_into_a_closed_lane_is_taken_back(knows: str) -> None:
+    """At once if it knows; else its commands have no effect for some ticks."""
     rig, target = up_and_running(), (HOME[0], 2)
     rig.accept((0, HOME, target))
     while rig.controller.hold_cell != target:
@@ -299,17 +299,20 @@ def test_it_begins_anew_when_its_move_into_a_closed_lane_is_taken_back(knows: bo
     near_m = rig.state[0] + 220.0
     parts = TemporaryParts((TemporaryClosure(2, near_m, near_m + 10.0),))
     assert rig.vehicle.close(LaneEnds(SCENARIO, parts), rig.tick * TICK_S)
-    if knows:
+    if knows == "the part":
         rig.agent.on_obstacles(parts)
+    elif knows:
+        rig.agent._begun = None  # it has taken over in mid-move
     repeats, incarnation = 0, rig.controller.record.incarnation
     while rig.controller.record.incarnation == incarnation:
         (command,) = sent(rig.hand(topics.SENSE, rig.sense()), Command)
         repeats += not rig.controller.accept_command(command)
-        # It is no fault of the agent's.
+        # It is no fault of the agent's, and an answer in time.
+        assert rig.controller.command_tick == rig.tick
         assert (rig.controller.hold_cell, rig.controller.refusal) == (HOME, None)
         rig.coast(1)
         assert repeats <= MAX_REPEATS + 2
-    assert (repeats == 0) is knows
+    assert (repeats == 0) is bool(knows)
     # With a new plan it may move there, unless it has waited so long that it is too late.
     state = rig.run(30)
     assert (state.hold_cell, state.moving) == (HOME, False)
@@ -345,6 +348,17 @@ def test_only_moves_into_lanes_that_are_closed_soon_are_taken_back(
     parts = TemporaryParts((TemporaryClosure(2, near_m, near_m + 10.0),))
     assert rig.vehicle.close(LaneEnds(SCENARIO, parts), rig.tick * TICK_S) is back
     assert (rig.controller.hold_cell == HOME) is back
+
+
+def test_a_move_out_of_a_lane_that_ends_soon_is_not_taken_back() -> None:
+    rig = up_and_running()
+    rig.accept((0, HOME, (HOME[0], 2)))
+    while rig.controller.hold_cell == HOME:
+        rig.answer()
+    near_m = rig.state[0] + 150.0
+    parts = (TemporaryClosure(lane, near_m, near_m + 10.0) for lane in (HOME[1], 2))
+    lane_ends = LaneEnds(SCENARIO, TemporaryParts(tuple(parts)))
+    assert not rig.vehicle.close(lane_ends, rig.tick * TICK_S)
 
 
 def test_an_agent_drives_its_type_and_takes_no_plan_that_the_type_cannot_drive() -> None:

@@ -250,9 +250,14 @@ def has_new_targets(leader: FormationLeader, formation: Formation) -> bool:
 
 
 def has_lost_member(leader: FormationLeader, formation: Formation) -> bool:
-    """A member has left that has not completed the plan: it has stopped, and others await it."""
+    """A member has left before it has completed the plan, and nobody is under way: others await it.
+
+    It has stopped where its lane is closed. Those whose gate is open may need it no more.
+    """
     left = set(leader.formation.roster) - set(formation.roster)
-    return any(name in left and not state.done for name, state in leader.states.items())
+    unfinished = [(name, state) for name, state in leader.states.items() if not state.done]
+    under_way = any(state.go for name, state in unfinished if name not in left)
+    return not under_way and any(name in left for name, _ in unfinished)
 
 
 _OBSERVING, _PREPARING, _PLANNING, _ISSUING, _IN_FORCE, _BACKING_OFF, _ = (

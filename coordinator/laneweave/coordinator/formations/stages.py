@@ -39,6 +39,8 @@ SORTING_M = 300.0
 """Length of road behind the line of a closed part in which a formation can sort its lanes."""
 QUEUE_M = 10.0
 """Lengths of queues before lines are rounded up to multiples of this."""
+MAX_OVERTAKING_S = 25.0
+"""Maximum time for which a formation leaves a lane to others; slower ones drive behind it."""
 LEFT_M = 1.0
 """Length of a lane that is left behind the last part that a formation leaves to others, and minimum
 length of such a part."""
@@ -183,9 +185,10 @@ def stages(
     structures = [one for one in scenario.formation.structures if one.from_m >= passed_m]
     formed_m = pairwise([*(one.from_m for one in structures), start_m])
     sections = cut(scenario.geometry.sections, avoided)
-    no_line = {(one.lane, one.from_m) for one in overtaken}
+    # Where others overtake, nobody stops, but for a closed part in the same place.
+    last_m = {(one.lane, one.from_m): _last_m(one, closed, scenario) for one in overtaken}
     lines_m = [
-        one.to_m if (one.lane, one.to_m) in no_line else to_line.to_m
+        last_m.get((one.lane, one.to_m), to_line.to_m)
         for one, to_line in zip(sections, sections_to_lines(scenario, avoided), strict=True)
     ]
     parts = [
@@ -213,6 +216,18 @@ def stages(
         evolve(stage, number=number, is_last=number == len(made) - 1, sorted_before=number > first)
         for number, stage in enumerate(made)
     )
+
+
+def _last_m(
+    overtaking: Overtaking, closed: Sequence[TemporaryClosure], scenario: Scenario
+) -> float:
+    """Return where moves must have ended in a lane in which others overtake."""
+    lines_m = (
+        part.from_m - part.late_m - re_entry(scenario).room_m
+        for part in closed
+        if part.lane == overtaking.lane and overtaking.from_m <= part.from_m <= overtaking.to_m
+    )
+    return min([overtaking.from_m, *lines_m])
 
 
 def _begun(section: LaneSection, from_m: float) -> LaneSection:
@@ -277,7 +292,7 @@ def where_overtaken(
         begins_m = lattice.cell_s_m(front, until_s)
         ends_m = max(lattice.cell_s_m(rear, overtaken_s), begins_m + LEFT_M)
         ends_m = min(ends_m, road_m - LEFT_M)
-        if ends_m > max(begins_m, 0.0):
+        if ends_m > max(begins_m, 0.0) and overtaken_s - until_s <= MAX_OVERTAKING_S:
             found.append(Overtaking(part.lane, begins_m, ends_m, until_s))
     return tuple(found)
 

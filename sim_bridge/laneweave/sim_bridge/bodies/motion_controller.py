@@ -225,9 +225,8 @@ class MotionController:
     def return_to_origin(self) -> bool:
         """Hold the cell in which the move began; return False if the vehicle may not.
 
-        It may until a later plan takes the cell, which no vehicle that moves takes part in. In a
-        formation, no other vehicle is led into the cell before the move is complete. The process in
-        charge may repeat the move until it learns of this; these commands are not accepted.
+        It may until a later plan takes the cell, which no vehicle that moves takes part in; in a
+        formation, until the move is complete. Commands that repeat the move are not accepted.
         """
         origin = self.motion.origin
         touched = origin[1] == self._body_lane_for(origin[1])
@@ -300,8 +299,7 @@ class MotionController:
             self.refusal = Refusal(Problem.VALUES)
             raise
         leaves = command.hold_cell != self.hold_cell
-        repeats = leaves and command.hold_cell == self.stop_lines.taken_back
-        if repeats or (self.off_lattice is not None and (leaves or len(jerks) > 0)):
+        if self.off_lattice is not None and (leaves or len(jerks) > 0):
             return False
         if incarnation > in_charge:
             if leaves:
@@ -316,6 +314,8 @@ class MotionController:
             self.refusal = Refusal(Problem.MOVE)
             return False
         if leaves:
+            if command.hold_cell == self.stop_lines.taken_back:
+                return False
             self.end_move(t_s)
             self.refusal = self._refusal_of_move(command)
             if self.refusal is not None:

@@ -10,7 +10,7 @@ from attrs import define, evolve
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.vehicle_tables import Vehicle
-from laneweave.protocol.vehicle.lane_ends import LaneEnds
+from laneweave.protocol.vehicle.lane_ends import SOON_S, LaneEnds
 from laneweave.protocol.vehicle.motion import State, cell_state
 from laneweave.protocol.vehicle.sudden_stops import stopping_m
 from laneweave.protocol.wire.messages import ClosedFormation, CurrentMotion, Name, Sense
@@ -155,19 +155,21 @@ class RoadVehicle:
 
         Parts of lanes are closed for a time, or open again. In a formation, a vehicle that moves
         into such a lane returns to its own, unless it has left it, or would still be in both at the
-        line. In the rolling operation it takes part in the plan that replaces that of the slot.
+        line, or its own ends soon, too. In the rolling operation it takes part in the plan that
+        replaces that of the slot.
         """
         controller, lines = self.controller, self.controller.stop_lines
         before, lines.lane_ends = lines.lane_ends, lane_ends
-        target = controller.hold_cell
+        origin, target = controller.motion.origin, controller.hold_cell
         in_both = target[1] in self.lanes_touched
         return (
             self.has_cell
             and not controller.store.territory.given_up_cells_stay_free
-            and controller.motion.origin[1] != target[1]
+            and origin[1] != target[1]
             and lane_ends.closed_soon(target, t_s)
             and not before.closed_soon(target, t_s)
             and not (in_both and lane_ends.closed_soon(target, t_s, RETURN_S))
+            and not lane_ends.has_passed(origin, t_s + SOON_S, body_m=self.state[0])
             and controller.return_to_origin()
         )
 

@@ -594,6 +594,11 @@ def test_l8_one_that_leaves_before_it_has_completed_the_plan_keeps_others_waitin
         hear(leader, state(B, ballot, (0, 1), accepted=True, done=done, t_s=1.0))
         leader.on_members(formation(A), 1.0)
         assert prepares_anew(leader, ballot) is not done
+    # Others are under way, and need it no more.
+    leader, ballot = watching(A, B)
+    hear(leader, state(A, ballot, (0, 1), accepted=True, go=True, t_s=1.0))
+    leader.on_members(formation(A), 1.0)
+    assert (leader.phase, leader.ballot) == (BallotPhase.IN_FORCE, ballot)
 
 
 def test_a_member_out_of_reach_is_planned_again_when_another_one_has_left() -> None:

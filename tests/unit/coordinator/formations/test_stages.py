@@ -276,6 +276,25 @@ def test_before_a_vehicle_overtakes_vehicles_leave_its_lane_and_sort_afterwards(
     assert moves_end_s([(0, 1)], numbers, evolve(around, until_s=1.0), scenario) == 1.0
 
 
+def test_a_slow_overtaking_is_left_to_the_vehicle_behind() -> None:
+    """A formation would leave its lane for the rest of the road."""
+    scenario = Scenario()
+    t_s = scenario.lattice.passing_time_s(COLUMNS[0], 100.0)
+    found = [
+        where_overtaken((ClearedPart(1, -60.0, 60.0, speed_mps, t_s),), COLUMNS, scenario)
+        for speed_mps in (15.5, 17.0, 20.0, 25.0, 40.0)
+    ]
+    assert [len(one) for one in found] == [0, 0, 0, 1, 1]
+
+
+def test_a_closed_part_keeps_its_line_where_a_vehicle_overtakes() -> None:
+    part = TemporaryClosure(1, 600.0, 620.0)
+    for from_m, to_m in ((580.0, 605.0), (580.0, 900.0), (560.0, 590.0), (400.0, 900.0)):
+        around = stages(Scenario(), (part,), (Overtaking(1, from_m, to_m, 40.0),))[0]
+        line_m = part.from_m - ROOM_M if to_m >= part.from_m else math.inf
+        assert around.to_m == min(from_m, line_m, part.from_m - ROOM_M)
+
+
 def test_a_vehicle_that_overtakes_at_the_end_of_the_road_leaves_a_lane_to_its_end() -> None:
     scenario = Scenario()
     part = ClearedPart(2, 420.0, 560.0, 25.0, scenario.lattice.passing_time_s(-14, 650.0))
