@@ -314,8 +314,6 @@ class MotionController:
             self.refusal = Refusal(Problem.MOVE)
             return False
         if leaves:
-            if command.hold_cell == self.stop_lines.taken_back:
-                return False
             self.end_move(t_s)
             self.refusal = self._refusal_of_move(command)
             if self.refusal is not None:
@@ -339,6 +337,8 @@ class MotionController:
     def _refusal_of_move(self, command: Command) -> Refusal | None:
         """Return why no correct agent sends a command for another cell; None: one may send it."""
         origin, target = self.hold_cell, command.hold_cell
+        if target == self.stop_lines.taken_back:
+            return None
         if self._guard.moving_from is not None or command.motion.origin != origin:
             return Refusal(Problem.MOVE)
         if (target[0] - origin[0], target[1] - origin[1]) not in self._moves:

@@ -92,7 +92,9 @@ class StopLinesAhead:
         return s_m if past is None else max(s_m, past.reopens_m)
 
     def allow(self, command: Command, t_s: float) -> bool:
-        """Return whether a move may begin: in time in both lanes, and into no cleared part."""
+        """Return whether a move may begin: in time in both lanes, into no cleared part, and anew."""
+        if command.hold_cell == self.taken_back:
+            return False
         ends, move = self.lane_ends, (command.motion.origin, command.hold_cell)
         takes_s = command.motion.end_tick * self._scenario.runtime.tick_s - t_s
         return not ends or (
