@@ -92,7 +92,7 @@ class StopLinesAhead:
         return s_m if past is None else max(s_m, past.reopens_m)
 
     def allow(self, command: Command, t_s: float) -> bool:
-        """Return whether a move may begin: in time in both lanes, into no cleared part, not again."""
+        """Return whether a move may begin: not again, in time, and into no cleared part."""
         if command.hold_cell == self.taken_back:
             return False
         ends, move = self.lane_ends, (command.motion.origin, command.hold_cell)
