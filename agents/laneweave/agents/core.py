@@ -144,7 +144,8 @@ class AgentCore:
         self._begun: tuple[PlannedMove, int] | None = None
         """The move that was begun last, and its duration in ticks."""
         self._begun_with = 0, self._lane_ends
-        """The tick in which it was begun first, and the ends of lanes as known then."""
+        """The tick in which it was begun first, or this process took over, and the ends of lanes as
+        known then."""
         self._sense: Sense | None = None
         self._command: Command | None = None
         self._own = {"vehicle": vehicle}
@@ -304,10 +305,12 @@ class AgentCore:
         if sense.hold_cell == execution.hold_cell:
             # An open gate for a move that can no longer begin would keep leaders waiting.
             return bool(self._lane_ends) and execution.stuck
-        if self._begun is None or sense.tick > begin_tick + MAX_REPEATS:
+        if sense.tick > begin_tick + MAX_REPEATS:
             return True
         if not self._lane_ends:
             return False
+        if self._begun is None:
+            return True
         (_, origin, target), _ = self._begun
         # The motion controller refuses a whole move into a part that is closed or cleared.
         slot_s = execution.plan.slot_s if self._temporary and execution.plan is not None else None
@@ -393,7 +396,7 @@ class AgentCore:
 
     def _take_over(self, sense: Sense) -> None:
         """V1: continue the motion controller's current motion."""
-        self._begun = None
+        self._begun, self._begun_with = None, (sense.tick, self._lane_ends)
         self._driver.take_over(sense)
         self.execution = PlanExecution(
             vehicle=self.vehicle,

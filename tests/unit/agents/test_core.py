@@ -289,9 +289,11 @@ def test_it_begins_anew_if_its_vehicle_has_entered_the_lattice_again_unseen() ->
     assert rig.shown[-1].hold_cell == there
 
 
-@pytest.mark.parametrize("knows", ["the part", "that it has not begun the move", ""])
-def test_it_begins_anew_when_its_move_into_a_closed_lane_is_taken_back(knows: str) -> None:
-    """At once if it knows; else its commands have no effect for some ticks."""
+@pytest.mark.parametrize(("knows", "took_over"), [(True, False), (False, False), (False, True)])
+def test_it_begins_anew_when_its_move_into_a_closed_lane_is_taken_back(
+    knows: bool, took_over: bool
+) -> None:
+    """At once if it knows the part; else its commands have no effect for some ticks."""
     rig, target = up_and_running(), (HOME[0], 2)
     rig.accept((0, HOME, target))
     while rig.controller.hold_cell != target:
@@ -299,10 +301,10 @@ def test_it_begins_anew_when_its_move_into_a_closed_lane_is_taken_back(knows: st
     near_m = rig.state[0] + 220.0
     parts = TemporaryParts((TemporaryClosure(2, near_m, near_m + 10.0),))
     assert rig.vehicle.close(LaneEnds(SCENARIO, parts), rig.tick * TICK_S)
-    if knows == "the part":
+    if knows:
         rig.agent.on_obstacles(parts)
-    elif knows:
-        rig.agent._begun = None  # it has taken over in mid-move
+    if took_over:
+        rig.agent._begun = None  # in mid-move
     repeats, incarnation = 0, rig.controller.record.incarnation
     while rig.controller.record.incarnation == incarnation:
         (command,) = sent(rig.hand(topics.SENSE, rig.sense()), Command)
@@ -312,7 +314,7 @@ def test_it_begins_anew_when_its_move_into_a_closed_lane_is_taken_back(knows: st
         assert (rig.controller.hold_cell, rig.controller.refusal) == (HOME, None)
         rig.coast(1)
         assert repeats <= MAX_REPEATS + 2
-    assert (repeats == 0) is bool(knows)
+    assert (repeats == 0) is knows
     # With a new plan it may move there, unless it has waited so long that it is too late.
     state = rig.run(30)
     assert (state.hold_cell, state.moving) == (HOME, False)
