@@ -308,8 +308,8 @@ def with_queues(
     """Return parts that are closed for a time, so that their lines are before waiting vehicles.
 
     Those beyond the line do not move it. Parts of different lanes begin together if no formation
-    can move between them. The beginnings of queues are rounded, since every new one makes
-    formations plan again.
+    can move between them. The lengths of queues are rounded, since every new one makes formations
+    plan again.
 
     Args:
         closed: parts that are closed for a time.
