@@ -61,7 +61,7 @@ def test_the_others_drive_around_a_vehicle_that_breaks_down(tmp_path: Path, loss
     late = [name for name in stopped if entered_s[name] > obstacle.since_s]
     assert len(late) <= 2 < len(entered_s) - len(late)
     closed = [(one["from_m"], one["to_m"]) for one in events(tmp_path / "run", PART_CLOSED)]
-    # While it slows down, the part grows behind the vehicle ahead, up to where it stands.
+    # While the vehicle slows down, its part is extended: at most to the vehicle ahead.
     assert 2 <= len(closed) <= 5
     assert {from_m for from_m, _ in closed} == {closed[0][0]}
     ends_m = [to_m for _, to_m in closed]

@@ -293,7 +293,7 @@ def test_it_begins_anew_if_its_vehicle_has_entered_the_lattice_again_unseen() ->
 def test_it_begins_anew_when_its_move_into_a_closed_lane_is_taken_back(
     knows: bool, took_over: bool
 ) -> None:
-    """At once if it knows the part; else its commands have no effect for some ticks."""
+    """At once if the agent knows the part; otherwise after `MAX_REPEATS` ticks."""
     rig, target = up_and_running(), (HOME[0], 2)
     rig.accept((0, HOME, target))
     while rig.controller.hold_cell != target:
@@ -309,13 +309,13 @@ def test_it_begins_anew_when_its_move_into_a_closed_lane_is_taken_back(
     while rig.controller.record.incarnation == incarnation:
         (command,) = sent(rig.hand(topics.SENSE, rig.sense()), Command)
         repeats += not rig.controller.accept_command(command)
-        # It is no fault of the agent's, and an answer in time.
+        # The command counts as an answer in time, and as correct.
         assert rig.controller.command_tick == rig.tick
         assert (rig.controller.hold_cell, rig.controller.refusal) == (HOME, None)
         rig.coast(1)
         assert repeats <= MAX_REPEATS + 2
     assert (repeats == 0) is knows
-    # With a new plan it may move there, unless it has waited so long that it is too late.
+    # A new plan may lead the vehicle there while the line is far enough ahead.
     state = rig.run(30)
     assert (state.hold_cell, state.moving) == (HOME, False)
     if knows:

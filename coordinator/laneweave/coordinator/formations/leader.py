@@ -250,9 +250,10 @@ def has_new_targets(leader: FormationLeader, formation: Formation) -> bool:
 
 
 def has_lost_member(leader: FormationLeader, formation: Formation) -> bool:
-    """A member has left before it has completed the plan, and nobody is under way: others await it.
+    """A member has left before completing the plan, which no other member is executing.
 
-    It has stopped where its lane is closed. Those whose gate is open may need it no more.
+    The member has stopped before a closed part, so the start gates of the others stay closed. With
+    an open gate, a member may no longer depend on it.
     """
     left = set(leader.formation.roster) - set(formation.roster)
     unfinished = [(name, state) for name, state in leader.states.items() if not state.done]

@@ -69,8 +69,7 @@ class FormationsOperation:
         self._rules = rules
         self._groups = Groups()
         self._parts = NO_PARTS
-        """Parts of lanes that are closed for a time or about to be closed, and what is cleared for
-        fast vehicles."""
+        """Parts of lanes that are closed for a time, will be, or are cleared for fast vehicles."""
         self._heed_nothing()
         self._planner = FormationPlanner(scenario, self._groups, self.leaders, new_job, plan)
 
@@ -83,7 +82,7 @@ class FormationsOperation:
 
     def _heed_nothing(self) -> None:
         self._heeded = NO_PARTS
-        """Parts, with the queues before closed ones, with which formations plan now."""
+        """The parts that plans take into account now; closed ones include their queues."""
         self._heeded_s = -math.inf
         """Road time of the last change of these."""
         self._heed_again_s = math.inf

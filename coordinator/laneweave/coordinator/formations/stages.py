@@ -32,13 +32,13 @@ from laneweave.protocol.road_layout import (
 )
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.formation_table import DrivingStructure
-from laneweave.protocol.vehicle.lane_ends import re_entry, sections_to_lines
+from laneweave.protocol.vehicle.lane_ends import sections_to_lines, stop_line_m
 from laneweave.protocol.wire.messages import Census, OffLattice
 
 SORTING_M = 300.0
 """Length of road behind the line of a closed part in which a formation can sort its lanes."""
 QUEUE_M = 10.0
-"""Lengths of queues before lines are rounded up to multiples of this."""
+"""Queue lengths at stop lines are rounded up to multiples of this."""
 MAX_OVERTAKING_S = 25.0
 """Maximum time for which a formation leaves a lane to others; slower ones drive behind it."""
 LEFT_M = 1.0
@@ -51,11 +51,11 @@ class Overtaking(NamedTuple):
 
     lane: int
     from_m: float
-    """Where the front of the formation is when all have left the lane."""
+    """Where the front of the formation is at `until_s`."""
     to_m: float
-    """Where its rear is when all have been overtaken."""
+    """Where the rear of the formation is when the vehicle has passed its front."""
     until_s: float
-    """Road time by which all have left the lane."""
+    """Road time by which all members have left the lane."""
 
     @property
     def closure(self) -> TemporaryClosure:
@@ -223,7 +223,7 @@ def _last_m(
 ) -> float:
     """Return where moves must have ended in a lane in which others overtake."""
     lines_m = (
-        part.from_m - part.late_m - re_entry(scenario).room_m
+        stop_line_m(part, scenario)
         for part in closed
         if part.lane == overtaking.lane and overtaking.from_m <= part.from_m <= overtaking.to_m
     )
@@ -318,12 +318,12 @@ def with_queues(
     """
     if not closed:
         return ()  # as in nearly every tick
-    parts, room_m = sorted(closed), re_entry(scenario).room_m
+    parts = sorted(closed)
     waiting = [body for body in census.off_lattice if _goes_on(body, scenario)]
     with_their_queues = list[TemporaryClosure]()
     for part in parts:
         passed_m = [one.to_m for one in parts if one.lane == part.lane and one.to_m <= part.from_m]
-        line_m = part.from_m - part.late_m - room_m
+        line_m = stop_line_m(part, scenario)
         queue_m = [
             line_m - body.rear_m
             for body in waiting

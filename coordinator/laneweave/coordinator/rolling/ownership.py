@@ -172,7 +172,7 @@ class _Sign(Enum):
 
 
 _LASTING = (_Sign.OPEN, _Sign.CLOSED, _Sign.NEVER_READY)
-"""Evidence that a vehicle no longer shows when it has a newer transfer."""
+"""Evidence that a vehicle no longer reports once it has a newer transfer."""
 
 
 def _signs(

@@ -37,8 +37,8 @@ class OperationTraits:
     accel_ratio: float
     """Peak acceleration of a minimum-jerk move, divided by the limit, if T_F is not given."""
     clearing_slots: int
-    """Slots in which vehicles leave a lane that is cleared ahead of a fast vehicle as it enters:
-    plans, and vehicles that can leave it only after a neighbour has, take one each."""
+    """Time in slots that vehicles get to leave the lane ahead of a fast vehicle that enters: one
+    for planning, one for each vehicle that can leave only after a neighbour."""
     planner: str | None = None
     """Name of the operation's own planner; None: `formation.solver` is used."""
 

@@ -252,7 +252,7 @@ class LaneEnds:
         return False
 
     def closed_soon(self, cell: Cell, t_s: float, soon_s: float = SOON_S) -> bool:
-        """Return whether the lane of a cell is closed for a time soon ahead of it."""
+        """Return whether a cell will reach the line of a part closed for a time in `soon_s`."""
         end = self.ahead(cell[1], self._lattice.cell_s_m(cell[0], t_s))
         return end is not None and end.sudden and self._is_beyond(end, cell, t_s + soon_s)
 
@@ -396,6 +396,11 @@ def sections_to_lines(
         evolve(section, to_m=lines_m.get(section, section.to_m))
         for section in cut(scenario.geometry.sections, closed)
     )
+
+
+def stop_line_m(part: TemporaryClosure, scenario: Scenario) -> float:
+    """Return the position of the stop line before a part that is closed for a time."""
+    return part.from_m - re_entry(scenario).room_m - part.late_m
 
 
 def early_start_m(scenario: Scenario) -> float:

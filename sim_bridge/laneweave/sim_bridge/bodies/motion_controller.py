@@ -256,7 +256,7 @@ class MotionController:
         self._stop_motion()
 
     def re_enter(self, cell: Cell, open_lanes: Iterable[int]) -> None:
-        """Start from standing towards a cell that is kept free (`StopLinesAhead.start`)."""
+        """Start from standstill towards a cell that is kept free; see `StopLinesAhead.start`."""
         self.off_lattice, self.hold_cell = OffLatticePhase.RE_ENTERING, cell
         self.broken_mps2, self.stays = None, False
         self.stop_lines.start(cell[1], open_lanes, self.measured[0])

@@ -19,7 +19,7 @@ from attrs import define, frozen
 from laneweave.protocol.road_layout import LanePosition, TemporaryClosure, TemporaryParts
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.road_tables import RoadEvent
-from laneweave.protocol.vehicle.lane_ends import LaneEnds, re_entry
+from laneweave.protocol.vehicle.lane_ends import LaneEnds, re_entry, stop_line_m
 from laneweave.protocol.vehicle.sudden_stops import (
     begins_m,
     queue_pitch_m,
@@ -316,14 +316,11 @@ class Obstacles:
         while True:
             late_m = min(late * self._queue_m + (SPARE_M if late else 0.0), most_m)
             with_room = part._replace(late_m=late_m)
-            found = sum(not stops_before(self._line_m(with_room), *each) for each in behind)
+            line_m = stop_line_m(with_room, self._scenario)
+            found = sum(not stops_before(line_m, *each) for each in behind)
             if found <= late:
                 return with_room
             late = found
-
-    def _line_m(self, part: TemporaryClosure) -> float:
-        """Return the stop line before a part."""
-        return part.from_m - re_entry(self._scenario).room_m - part.late_m
 
     def _room_ahead_m(self, lane: int, from_m: float) -> float:
         """Return the room that vehicles that enter the lane do not need to stop before a part.

@@ -325,7 +325,7 @@ class PassingVehicles:
         """Return what is cleared for a vehicle that waits for room to enter."""
         from_m, to_m = passage.from_m, passage.to_m
         if self.is_fast(passage):
-            # Where it may enter, some others are still allowed to change into its lane.
+            # A slot shorter than the room that it needs: farther ahead, vehicles may change lanes.
             slots = self._scenario.formation.traits.clearing_slots - 1
             to_m += self._cleared_ahead_m(passage, slots)
         else:

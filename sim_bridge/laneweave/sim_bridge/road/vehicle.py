@@ -28,10 +28,8 @@ from laneweave.sim_bridge.road.entry import Admission
 
 NEAR_M = 0.01
 """Distance from its cell up to which an entering vehicle need not settle."""
-
-
 RETURN_S = 4.5
-"""Time after which a body that is in two lanes is surely back in its own."""
+"""Upper bound of the time in which a body that is in two lanes returns to its own."""
 
 
 @define
@@ -161,15 +159,16 @@ class RoadVehicle:
         controller, lines = self.controller, self.controller.stop_lines
         before, lines.lane_ends = lines.lane_ends, lane_ends
         origin, target = controller.motion.origin, controller.hold_cell
-        in_both = target[1] in self.lanes_touched
         return (
             self.has_cell
             and not controller.store.territory.given_up_cells_stay_free
             and origin[1] != target[1]
             and lane_ends.closed_soon(target, t_s)
             and not before.closed_soon(target, t_s)
-            and not (in_both and lane_ends.closed_soon(target, t_s, RETURN_S))
             and not lane_ends.has_passed(origin, t_s + SOON_S, body_m=self.state[0])
+            and not (
+                target[1] in self.lanes_touched and lane_ends.closed_soon(target, t_s, RETURN_S)
+            )
             and controller.return_to_origin()
         )
 

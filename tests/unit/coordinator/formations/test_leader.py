@@ -588,7 +588,7 @@ def test_states_of_vehicles_that_left_are_forgotten(reach: Reach) -> None:
 
 
 def test_l8_one_that_leaves_before_it_has_completed_the_plan_keeps_others_waiting() -> None:
-    """It has stopped where its lane is closed: it does not accept, or complete its moves."""
+    """It stops before a closed part, so it neither accepts the plan nor completes its moves."""
     for done in (True, False):
         leader, ballot = watching(A, B)
         hear(leader, state(B, ballot, (0, 1), accepted=True, done=done, t_s=1.0))

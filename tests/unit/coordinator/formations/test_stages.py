@@ -291,8 +291,7 @@ def test_a_closed_part_keeps_its_line_where_a_vehicle_overtakes() -> None:
     part = TemporaryClosure(1, 600.0, 620.0)
     for from_m, to_m in ((580.0, 605.0), (580.0, 900.0), (560.0, 590.0), (400.0, 900.0)):
         around = stages(Scenario(), (part,), (Overtaking(1, from_m, to_m, 40.0),))[0]
-        line_m = part.from_m - ROOM_M if to_m >= part.from_m else math.inf
-        assert around.to_m == min(from_m, line_m, part.from_m - ROOM_M)
+        assert around.to_m == min(from_m, part.from_m - ROOM_M)
 
 
 def test_a_vehicle_that_overtakes_at_the_end_of_the_road_leaves_a_lane_to_its_end() -> None:
@@ -317,7 +316,7 @@ def test_a_lane_is_closed_from_its_queue_on() -> None:
     scenario = Scenario()
     assert with_queues((PART,), waiting(), scenario) == (PART,)
     line_m = PART.from_m - ROOM_M
-    # Vehicles in the part, beyond its line, and in other lanes do not wait at the line.
+    # Vehicles in the part, beyond its stop line or in other lanes are not in the queue.
     passed = waiting((1, 305.0), (1, 283.0), (1, line_m), (2, line_m - 5.0))
     assert with_queues((PART,), passed, scenario) == (PART,)
     for queue_m, length_m in ((5.0, 10.0), (22.0, 30.0)):

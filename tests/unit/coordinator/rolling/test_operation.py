@@ -283,7 +283,7 @@ def test_one_that_brakes_before_a_closed_part_keeps_its_cells(
 
 
 def test_a_slot_may_be_planned_a_third_time() -> None:
-    """Vehicles still store the transfers of the first ballot then."""
+    """Vehicles then still store the transfers of the first ballot."""
     desk = bench(A, B, ways={A: ((0, 0), (0, 1))})
     earlier = in_force_when_a_part_is_closed(desk, {A: ((0, 0), (1, 0))})
     desk.think(LOOK_S + 1.0)
