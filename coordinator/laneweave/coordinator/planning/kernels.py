@@ -41,6 +41,8 @@ NICENESS: Final = 10
 """Increase of the niceness of a compilation in the background."""
 ATTEMPTS: Final = 2
 """Number of compilations; the second one if the first was killed."""
+LOADING_S: Final = 2.0
+"""Maximum time to wait until compiled code is loaded when the process ends."""
 _PROGRAM: Final = f"from {__name__} import compile_for_parent; compile_for_parent()"
 
 
@@ -240,13 +242,15 @@ class BackgroundCompilation:
         """Start unless the kernels are loaded."""
         self._kernels = kernels
         self._process: subprocess.Popen[str] | None = None
+        self._thread: threading.Thread | None = None
         self._closed = False
         self._lock = threading.Lock()
         if not kernels.loaded:
             log.warning(
                 "a solver is being compiled; until then TAPPA makes all plans", solver=kernels.name
             )
-            threading.Thread(target=self._run, name="compilation", daemon=True).start()
+            self._thread = threading.Thread(target=self._run, name="compilation", daemon=True)
+            self._thread.start()
 
     def close(self) -> None:
         """Kill the process if it still runs; what it has compiled stays in the cache."""
@@ -256,6 +260,10 @@ class BackgroundCompilation:
         if process is not None:
             process.kill()
             process.wait()
+        if self._thread is not None:
+            # One that loads compiled code when the interpreter ends could abort this process; one
+            # that waits for another process cannot.
+            self._thread.join(LOADING_S)
 
     def _run(self) -> None:
         solver, error = self._kernels.name, ""
@@ -265,6 +273,8 @@ class BackgroundCompilation:
                     if self._closed or self._kernels.load_if_compiled():
                         break
                     error = self._compile()
+            if self._closed:
+                return
             if self._kernels.load_if_compiled():
                 log.info("a solver is available", solver=solver)
                 return

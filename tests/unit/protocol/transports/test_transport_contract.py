@@ -798,3 +798,44 @@ def test_a_core_runs_over_zenoh_until_it_ends(router: Router) -> None:
     assert kinds[0] is node.Started
     for kind in (node.Wakeup, node.Arrived, node.Computed, node.PeerUp, node.QueryArrived):
         assert kinds.count(kind) == 1
+
+
+@define
+class Busy:
+    """A core that ends while its computation, which would take long, is under way."""
+
+    begun: threading.Event = field(factory=threading.Event)
+    ended: threading.Event = field(factory=threading.Event)
+    wakeup_s: float | None = None
+
+    def handle(self, event: node.Event, now_s: float) -> Iterator[node.Effect]:
+        match event:
+            case node.Started():
+                yield node.Compute(1, self.compute)
+                yield node.Compute(2, lambda _: self.begun.clear())
+                self.wakeup_s = now_s
+            case node.Wakeup():
+                self.wakeup_s = None
+                assert self.begun.wait(WAIT_S)
+                yield node.End()
+            case _:
+                pass
+
+    def compute(self, clock: node.Clock) -> None:
+        self.begun.set()
+        deadline_s = clock() + WAIT_S
+        try:
+            while clock() < deadline_s:
+                time.sleep(1e-3)
+        finally:
+            self.ended.set()
+
+
+@pytest.mark.slow
+def test_no_computation_is_under_way_when_the_process_ends(router: Router) -> None:
+    core, before = Busy(), set(threading.enumerate())
+    a_core: node.Core = core
+    run_core(a_core, Access(router.endpoint, REALM, LEASE_S))
+    assert core.ended.is_set()
+    assert core.begun.is_set()  # the second computation was discarded
+    assert not {thread for thread in threading.enumerate() if thread not in before}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import queue
 import sys
@@ -22,6 +23,7 @@ from laneweave.protocol.runtime.node import (
     Node,
     Started,
     StopJob,
+    StoppedError,
     Stopping,
     Wakeup,
     run_job,
@@ -43,6 +45,8 @@ SWITCH_S = 1e-4
 With the default, a flood of messages that are refused lets hardly any others in."""
 ONE_SIGNAL_S = 0.2
 """Time in which stop signals are one: `timeout` and shells send each of them twice."""
+WORKER_END_S = 5.0
+"""Maximum time to wait for the end of a computation that has been stopped."""
 
 
 def run_core(
@@ -67,31 +71,31 @@ def run_core(
     sys.setswitchinterval(SWITCH_S)
     keys = Keys(access.realm)
     inbox = Inbox()
-    worker = _Worker(inbox.put)
+    with contextlib.closing(_Worker(inbox.put)) as worker:
 
-    def submit(job: Compute | Delegate | StopJob) -> None:
-        if isinstance(job, Compute):
-            worker.submit(job)
-        elif pool is None:
-            inbox.put(Computed(job.job, None, "this process has no workers"))
-        elif isinstance(job, Delegate):
-            pool.submit(job, inbox.put)
-        else:
-            pool.stop(job.job)
+        def submit(job: Compute | Delegate | StopJob) -> None:
+            if isinstance(job, Compute):
+                worker.submit(job)
+            elif pool is None:
+                inbox.put(Computed(job.job, None, "this process has no workers"))
+            elif isinstance(job, Delegate):
+                pool.submit(job, inbox.put)
+            else:
+                pool.stop(job.job)
 
-    with stop_signals(_StopSignals(inbox.put, grace_s)):
-        # Until the process is connected, the inbox can contain only `Stopping`.
-        transport = connect(access, inbox.put, lambda wait_s: any(inbox.take(wait_s)))
-        if transport is None:
-            return
-        node = Node(core, transport, keys, submit, Name(f"{os.getpid()}-{time.time_ns()}"))
-        observe(snapshot_source(inbox.put))
-        try:
-            node.dispatch(Started(), time.monotonic())
-            while not node.ended:
-                _step(node, inbox)
-        finally:
-            transport.close()
+        with stop_signals(_StopSignals(inbox.put, grace_s)):
+            # Until the process is connected, the inbox can contain only `Stopping`.
+            transport = connect(access, inbox.put, lambda wait_s: any(inbox.take(wait_s)))
+            if transport is None:
+                return
+            node = Node(core, transport, keys, submit, Name(f"{os.getpid()}-{time.time_ns()}"))
+            observe(snapshot_source(inbox.put))
+            try:
+                node.dispatch(Started(), time.monotonic())
+                while not node.ended:
+                    _step(node, inbox)
+            finally:
+                transport.close()
 
 
 def _step(node: Node, inbox: Inbox) -> None:
@@ -139,20 +143,38 @@ class _StopSignals:
 
 
 class _Worker:
-    """Daemon thread for computations, started when the first one is submitted."""
+    """Thread for computations, started when the first one is submitted.
+
+    It must end before the interpreter does, which aborts the process if a thread is then in
+    compiled code (measured: `numpy.unique`).
+    """
 
     def __init__(self, done: Callable[[Computed], None]) -> None:
         """Create the worker; `done` is called from its thread."""
         self._done = done
-        self._jobs: queue.SimpleQueue[Compute] | None = None
+        self._jobs: queue.SimpleQueue[Compute | None] = queue.SimpleQueue()
+        self._thread: threading.Thread | None = None
+        self._closed = False
 
     def submit(self, job: Compute) -> None:
         """Queue a job."""
-        if self._jobs is None:
-            self._jobs = queue.SimpleQueue()
-            threading.Thread(target=self._work, args=(self._jobs,), daemon=True).start()
+        if self._thread is None:
+            self._thread = threading.Thread(target=self._work, name="compute", daemon=True)
+            self._thread.start()
         self._jobs.put(job)
 
-    def _work(self, jobs: queue.SimpleQueue[Compute]) -> None:
-        while True:
-            self._done(run_job(jobs.get()))
+    def close(self) -> None:
+        """Stop the computation, discard those that wait, and end the thread."""
+        self._closed = True
+        self._jobs.put(None)
+        if self._thread is not None:
+            self._thread.join(WORKER_END_S)
+
+    def _clock(self) -> float:
+        if self._closed:
+            raise StoppedError
+        return time.monotonic()
+
+    def _work(self) -> None:
+        while (job := self._jobs.get()) is not None and not self._closed:
+            self._done(run_job(job, self._clock))
