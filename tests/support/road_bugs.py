@@ -11,17 +11,20 @@ from msgspec.structs import replace
 
 from laneweave.agents.core import AgentCore
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.road_layout import Exits, LanePosition, TemporaryClosure
+from laneweave.protocol.road_layout import Exits, TemporaryClosure
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.vehicle_tables import Vehicle
 from laneweave.protocol.scenario.vehicle_types import VehicleTypes
-from laneweave.protocol.vehicle.lane_end import LaneEnd, ReEntry
+from laneweave.protocol.vehicle.lane_end import LaneEnd
 from laneweave.protocol.vehicle.lane_ends import LaneEnds
 from laneweave.protocol.vehicle.plan_execution import PlanExecution
+from laneweave.protocol.vehicle.re_entry import ReEntry, own_re_entry
 from laneweave.protocol.vehicle.sudden_stops import stopping_m
 from laneweave.protocol.wire.messages import Census, CensusEntry, Command, Name, Sense
 from laneweave.sim_bridge.bodies import motion_controller
 from laneweave.sim_bridge.bodies.motion_controller import MotionController, OffLatticePhase
 from laneweave.sim_bridge.bodies.stop_lines import StopLinesAhead
-from laneweave.sim_bridge.road import lane_end_control
+from laneweave.sim_bridge.road import lane_end_control, restarts
 from laneweave.sim_bridge.road.allocation import CellAllocation
 from laneweave.sim_bridge.road.entry import EntryMeter
 from laneweave.sim_bridge.road.formation_building import (
@@ -32,6 +35,7 @@ from laneweave.sim_bridge.road.formation_building import (
 from laneweave.sim_bridge.road.lane_end_control import LaneEndControl
 from laneweave.sim_bridge.road.obstacles import Obstacles
 from laneweave.sim_bridge.road.passing_vehicles import PassingVehicle, PassingVehicles
+from laneweave.sim_bridge.road.restarts import Waiting
 from laneweave.sim_bridge.road.roadside import EntranceRoom, Roadside
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
 from laneweave.sim_bridge.road.vehicles_in_part import VehiclesInPart
@@ -154,7 +158,7 @@ def gap_is_entered(patch: Patch) -> None:
     patch.setattr(EntryMeter, "keep_free", keep_free)
 
 
-@breaks(LANE_ENDS, lane_end_control, "re_entry", "own_re_entry")
+@breaks(LANE_ENDS, restarts, "re_entry", "own_re_entry")
 def gap_too_short(needed: Callable[..., ReEntry], *given: object) -> ReEntry:
     """A gap has room for the vehicle, but not for re-entry."""
     return evolve(needed(*given), columns=1)
@@ -163,14 +167,16 @@ def gap_too_short(needed: Callable[..., ReEntry], *given: object) -> ReEntry:
 @breaks(LANE_ENDS)
 def starts_without_a_gap(patch: Patch) -> None:
     """Vehicles re-enter long before their gap passes."""
-    start: Callable[..., object] = LaneEndControl._start
+    can_start: Callable[..., object] = LaneEndControl._can_start
 
-    def mutant(self: LaneEndControl, vehicle: object, gaps: object, t_s: float) -> object:
-        return start(self, vehicle, gaps, t_s + 30.0)
+    def mutant(
+        self: LaneEndControl, one: object, gap: object, vehicles: object, t_s: float
+    ) -> object:
+        return can_start(self, one, gap, vehicles, t_s + 30.0)
 
     patch.setattr(lane_end_control, "START_S", 1e9)
     patch.setattr(LaneEndControl, "_is_free", lambda *_: True)
-    patch.setattr(LaneEndControl, "_start", mutant)
+    patch.setattr(LaneEndControl, "_can_start", mutant)
 
 
 @breaks(LANE_ENDS)
@@ -248,13 +254,13 @@ def parts_are_closed_around_vehicles(*_: object) -> VehiclesInPart:
     return VehiclesInPart((), (), ())
 
 
-@breaks(OBSTACLES, LaneEndControl, "_is_over")
+@breaks(OBSTACLES, LaneEndControl, "_has_passed")
 def gaps_end_at_the_line(
-    is_over: Callable[..., bool], self: LaneEndControl, gap: object, _last_m: float, t_s: float
+    has_passed: Callable[..., bool], self: LaneEndControl, gap: object, _s_m: float, t_s: float
 ) -> bool:
-    """A gap counts as passed once it has passed the stop line, not the first vehicle."""
-    line_m = min(end.line_m for end in self._ends.values())
-    return is_over(self, gap, line_m, t_s)
+    """A gap counts as passed once it has passed the stop line, not a vehicle beyond it."""
+    line_m = min(end.line_m for end in self._restarts.ends.values())
+    return has_passed(self, gap, line_m, t_s)
 
 
 @breaks(OBSTACLES, Roadside, "_lanes_past")
@@ -274,12 +280,23 @@ def moves_into_closed_lanes_go_on(*_: object) -> bool:
 
 
 @breaks(OBSTACLES, LaneEndControl, "_may_start_at_gap")
-def gaps_only_after_the_repair(
-    _: object, control: LaneEndControl, at: LanePosition, vehicle: RoadVehicle
-) -> bool:
+def gaps_only_after_the_repair(_: object, control: LaneEndControl, one: Waiting) -> bool:
     """Columns are kept free for a waiting vehicle only once the cause is over."""
-    now_s = control._gap_arrives_s(at[0], vehicle) - vehicle.state[0] / control._lattice.speed_mps
-    return control._may_start(at, vehicle, now_s)
+    now_s = control._gap_arrives_s(one.at[0], one) - one.s_m / control._lattice.speed_mps
+    return control._restarts.may_start(one, now_s)
+
+
+@breaks(OBSTACLES, restarts, "re_entry_behind")
+def late_vehicles_wait_for_the_repair(*_: object) -> None:
+    """Vehicles between the line and a vehicle that stands wait until that is repaired."""
+
+
+@breaks(OBSTACLES, restarts, "re_entry_behind")
+def late_vehicles_start_as_others(
+    _: object, scenario: Scenario, limits: Vehicle, _room_m: float
+) -> ReEntry:
+    """A vehicle that has to start slowly gets a gap as at a stop line."""
+    return own_re_entry(scenario, limits)
 
 
 @breaks(OBSTACLES)

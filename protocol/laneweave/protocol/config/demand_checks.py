@@ -13,7 +13,7 @@ from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.formation_table import formation_columns
 from laneweave.protocol.scenario.road_tables import EntryPoint
 from laneweave.protocol.scenario.traffic_flow import Inflow
-from laneweave.protocol.vehicle.lane_ends import re_entry
+from laneweave.protocol.vehicle.re_entry import re_entry
 
 MIN_SIDE_GAP_M = 0.5
 """Minimum lateral gap between bodies side by side; covers rotation and tracking errors."""

@@ -28,10 +28,10 @@ from laneweave.protocol.vehicle.lane_ends import (
     early_start_m,
     exit_lanes,
     first_step_m,
-    lane_beside,
-    re_entry,
+    lanes_beside,
     sections_to_lines,
 )
+from laneweave.protocol.vehicle.re_entry import re_entry
 from laneweave.protocol.vehicle.sudden_stops import begins_m, room_before_part_m
 from laneweave.protocol.wire.messages import CAR
 
@@ -350,7 +350,7 @@ def check_dead_ends(scenario: Scenario) -> None:
             f"{needed.room_m:g} m for driving on after stopping at the end of the lane",
         )
         require(
-            end.taken_back or lane_beside(scenario, end.lane, end.line_m, sections) is not None,
+            end.taken_back or bool(lanes_beside(scenario, end.lane, end.line_m, sections)),
             name,
             end.end_m,
             f"the end of a lane beside one that is open from {end.line_m:g} m, its stop line, to "

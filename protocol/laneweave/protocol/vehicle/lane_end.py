@@ -1,4 +1,4 @@
-"""The end of a lane, and what a vehicle needs that re-enters before it; see `lane_ends`."""
+"""The end of a lane; see `lane_ends`."""
 
 from __future__ import annotations
 
@@ -29,23 +29,3 @@ class LaneEnd:
     """Whether SUMO takes back vehicles that do not change lanes; there is no re-entry."""
     sudden: bool = False
     """Whether it is the beginning of a part that is closed for a time."""
-
-
-@frozen
-class ReEntry:
-    """How a vehicle gets from standing at a stop line into the neighbouring lane."""
-
-    room_m: float
-    """Distance from the stop line to the end of the lane."""
-    columns: int
-    """Number of free columns that it needs in the neighbouring lane; it settles in the rearmost."""
-    distance_m: float
-    """Distance in which it settles in its cell."""
-
-    def covering(self, other: ReEntry) -> ReEntry:
-        """Return what suffices for both."""
-        return ReEntry(
-            max(self.room_m, other.room_m),
-            max(self.columns, other.columns),
-            max(self.distance_m, other.distance_m),
-        )

@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from functools import lru_cache, reduce
 
 from attrs import evolve
 
@@ -31,37 +30,15 @@ from laneweave.protocol.road_layout import (
     cut,
 )
 from laneweave.protocol.scenario.fields import Scenario
-from laneweave.protocol.scenario.vehicle_tables import Vehicle
-from laneweave.protocol.vehicle.emergency_brake import (
-    ERROR_SIGMAS,
-    EmergencyBrake,
-    own_braking_mps2,
-    spare_error_m,
-    stopping_distance_m,
-)
-from laneweave.protocol.vehicle.lane_end import LaneEnd, ReEntry
-from laneweave.protocol.vehicle.motion import (
-    ARRIVED_ALONG_M,
-    State,
-    cell_state,
-    commanded_state,
-    has_settled,
-    hold_law,
-    integrate,
-)
-from laneweave.protocol.wire.messages import Neighbour
+from laneweave.protocol.vehicle.emergency_brake import own_braking_mps2, stopping_distance_m
+from laneweave.protocol.vehicle.lane_end import LaneEnd
+from laneweave.protocol.vehicle.re_entry import ReEntry, re_entry
 
 BEFORE_TOUCHING = 0.6
 """Share of a move by which a body that changes lanes touches the other lane (by default 0.36)."""
 LATE_S = 0.2
 """Delay with which a move that leads out of a lane may still begin; longer ones could end with the
 body partly in the lane at its stop line."""
-START_S = 0.3
-"""Time after the front of a gap has passed in which a waiting vehicle may start into it."""
-_MAX_COLUMNS = 48
-"""Upper bound on the columns that a vehicle needs to re-enter."""
-_MAX_RE_ENTRY_S = 120.0
-_FAR_M = 1000.0
 HANDOVER_M = 4.0
 """Length of the lane behind an exit of a SUMO simulation, where SUMO takes vehicles back."""
 TAKEN_BACK_M = 1.0
@@ -358,33 +335,40 @@ def _end_ahead(by_lane: Sequence[Sequence[LaneEnd]], lane: int, s_m: float) -> L
     return None
 
 
-def lane_beside(
-    scenario: Scenario, lane: int, at_m: float, sections: Iterable[LaneSection]
-) -> int | None:
-    """Return the lane into which a vehicle re-enters; None: there is none.
+def lanes_beside(
+    scenario: Scenario,
+    lane: int,
+    at_m: float,
+    sections: Iterable[LaneSection],
+    needed: ReEntry | None = None,
+) -> tuple[int, ...]:
+    """Return the lanes into which a vehicle can re-enter.
 
-    It is open from before the vehicle until that has arrived in its cell, and the first vehicles
-    enter it before that position: there, its cells can be kept free.
+    They are open from before the vehicle until that has arrived in its cell, and the first vehicles
+    enter them before that position: there, their cells can be kept free.
 
     Args:
         scenario: lattice and road.
         lane: lane in which the vehicle waits.
         at_m: position of its front.
         sections: those of the road, up to the stop lines in them; see `sections_to_lines`.
+        needed: what it needs; None: `re_entry`.
     """
-    needed = re_entry(scenario)
+    needed = needed or re_entry(scenario)
     pitch_m = scenario.lattice.pitch_m
     from_m = at_m - needed.columns * pitch_m - scenario.types.longest_body_m
     to_m = min(at_m + needed.distance_m, scenario.road.length_m)
     entry_m = dict(enumerate(scenario.geometry.entry_m))
-    for beside in (lane + 1, lane - 1):
-        if entry_m.get(beside, math.inf) > at_m:
-            continue
-        for section in sections:
-            begins_m = max(section.from_m, section.moves_from_m)
-            if section.lane == beside and begins_m <= from_m and to_m <= section.to_m:
-                return beside
-    return None
+    open_lanes = {
+        section.lane
+        for section in sections
+        if max(section.from_m, section.moves_from_m) <= from_m and to_m <= section.to_m
+    }
+    return tuple(
+        beside
+        for beside in (lane + 1, lane - 1)
+        if beside in open_lanes and entry_m.get(beside, math.inf) <= at_m
+    )
 
 
 def sections_to_lines(
@@ -415,84 +399,3 @@ def early_start_m(scenario: Scenario) -> float:
     shares = (tick / ticks for tick in range(ticks + 1))
     before = [x for x in shares if x**3 * (10.0 - 15.0 * x + 6.0 * x * x) <= untouched]
     return TRACKING_SHARE * max(before) * scenario.timing.move_s * scenario.formation.speed_mps
-
-
-def re_entry(scenario: Scenario) -> ReEntry:
-    """Return what every type of vehicle needs to drive from standing into the neighbouring lane.
-
-    The motion controller drives with its hold law towards a cell of the neighbouring lane behind
-    the one that passes the vehicle when it starts. Until the body has left its lane, it must be
-    able to stop before the end with the emergency brake, which bounds the room from below.
-
-    Raises:
-        ValueError: the vehicle does not arrive in a cell (its limits are too low).
-    """
-    first, *others = (own_re_entry(scenario, one.limits) for one in scenario.types.values())
-    return reduce(ReEntry.covering, others, first)
-
-
-@lru_cache(maxsize=256)
-def own_re_entry(scenario: Scenario, limits: Vehicle) -> ReEntry:
-    """Return what vehicles with some limits need; see `re_entry`.
-
-    Raises:
-        ValueError: the vehicle does not arrive in a cell.
-    """
-    for columns in range(2, _MAX_COLUMNS + 1):
-        found = [_re_entry(scenario, limits, columns, late_s) for late_s in (0.0, START_S)]
-        possible = [each for each in found if each is not None]
-        if len(possible) == len(found):
-            room_m, distance_m = (max(each) for each in zip(*possible, strict=True))
-            # Settling takes up to a second longer for starts between the two.
-            distance_m += scenario.formation.speed_mps
-            return ReEntry(math.ceil(room_m), columns, math.ceil(distance_m))
-    raise ValueError("vehicles that stand cannot get into the lattice within their limits")
-
-
-def _re_entry(
-    scenario: Scenario, limits: Vehicle, columns: int, late_s: float
-) -> tuple[float, float] | None:
-    """Return the `room_m` and `distance_m` of one motion of `re_entry`, not rounded.
-
-    Args:
-        scenario: lattice, tick, sensors and brakes.
-        limits: those of the vehicle.
-        columns: number of free columns; the vehicle is to settle in the rearmost.
-        late_s: time between the foremost column passing the vehicle and the start.
-
-    Returns:
-        None: the vehicle falls behind the columns, or does not settle.
-    """
-    lattice, tick_s = scenario.lattice, scenario.runtime.tick_s
-    assumed, noise = scenario.braking, scenario.sensing
-    goal: Cell = (1 - columns, 1)
-    brake, lag_s = EmergencyBrake(limits, assumed, tick_s), limits.actuator_lag_s
-    standing: State = (0.0, 0.0, 0.0, lattice.cell_y_m(0), 0.0, 0.0)
-    state = commanded_state(standing, (0.0, 0.0), limits, lattice.speed_mps)
-    clear_m = 0.5 * (lattice.lane_width_m + limits.width_m)
-    room_m = distance_m = settled_s = 0.0
-    clear = False
-    for tick in range(1, round(_MAX_RE_ENTRY_S / tick_s)):
-        t_s = late_s + tick * tick_s
-        jerk = hold_law(state, cell_state(lattice, goal, t_s - tick_s), limits, tick_s)
-        state = integrate(state, jerk, tick_s)
-        # The body is at most this far: it follows its commanded state.
-        s_m = state[0] + lag_s * (lattice.speed_mps - state[1]) + lag_s * max(state[2], 0.0)
-        if s_m < lattice.cell_s_m(goal[0], t_s) - ARRIVED_ALONG_M:
-            return None
-        if not clear:
-            speed_mps = state[1]
-            ahead = Neighbour(0, _FAR_M, 0.0)
-            body = (0.0, speed_mps, 0.0, 0.0, 0.0, 0.0)
-            needed_m = _FAR_M - brake.spare_m(body, state[2], jerk, [ahead])
-            errors_m = ERROR_SIGMAS * spare_error_m(
-                limits, assumed, noise, speed_mps, lattice.speed_mps
-            )
-            # A tick of travel covers starts between the two that are computed.
-            room_m = max(room_m, s_m + needed_m + errors_m + speed_mps * tick_s)
-            clear = state[3] - lattice.cell_y_m(0) > clear_m
-        if not has_settled(state, lattice, goal, t_s):
-            distance_m, settled_s = s_m, t_s + tick_s
-    if not clear or settled_s > _MAX_RE_ENTRY_S - 1.0:
-        return None
-    return room_m, distance_m

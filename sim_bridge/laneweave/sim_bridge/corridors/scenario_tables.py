@@ -17,7 +17,7 @@ from laneweave.protocol.scenario.formation_table import SLACK_S
 from laneweave.protocol.scenario.road_tables import MAIN_ENTRANCE, Closure
 from laneweave.protocol.scenario.timing import CYCLE_STEP_S, SHORTEST_CYCLE_S
 from laneweave.protocol.structuring import structure
-from laneweave.protocol.vehicle.lane_ends import own_re_entry, re_entry
+from laneweave.protocol.vehicle.re_entry import own_re_entry, re_entry
 from laneweave.protocol.wire.messages import CAR
 from laneweave.sim_bridge.corridors.corridor import (
     MAX_SPEED_MPS,

@@ -13,24 +13,16 @@ enters them is a formation of its own.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 
 from attrs import define, frozen
 
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.road_layout import NO_PARTS, LanePosition, LaneSection, TemporaryClosure
+from laneweave.protocol.road_layout import NO_PARTS, LanePosition
 from laneweave.protocol.scenario.fields import Scenario
-from laneweave.protocol.vehicle.lane_end import LaneEnd
-from laneweave.protocol.vehicle.lane_ends import (
-    NEAR_LINE_M,
-    START_S,
-    LaneEnds,
-    lane_beside,
-    own_re_entry,
-    re_entry,
-    sections_to_lines,
-)
+from laneweave.protocol.vehicle.lane_ends import LaneEnds
 from laneweave.protocol.vehicle.motion import ARRIVED_ALONG_M
+from laneweave.protocol.vehicle.re_entry import START_S
 from laneweave.protocol.vehicle.sudden_stops import queue_pitch_m
 from laneweave.protocol.vehicle.territory import territory_of
 from laneweave.protocol.wire.events import DRIVES_OUT, ENTERED_LATTICE, LEFT_LATTICE, MISSED_EXIT
@@ -39,6 +31,8 @@ from laneweave.sim_bridge.bodies.command_checks import BESIDE_M
 from laneweave.sim_bridge.bodies.motion_controller import OffLatticePhase
 from laneweave.sim_bridge.bodies.stop_lines import STANDING_MPS
 from laneweave.sim_bridge.road.entry import EntryMeter
+from laneweave.sim_bridge.road.obstacles import Obstacles
+from laneweave.sim_bridge.road.restarts import Restarts, Waiting
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
 
 OPEN_GAPS, CROWDED_GAPS = 1, 5
@@ -80,26 +74,21 @@ class LaneEndChange:
 class LaneEndControl:
     """Vehicles without cells, and the gaps that are kept free for them."""
 
-    def __init__(self, scenario: Scenario, meter: EntryMeter) -> None:
+    def __init__(self, scenario: Scenario, meter: EntryMeter, obstacles: Obstacles) -> None:
         """Begin without vehicles."""
         self._meter = meter
+        self._obstacles = obstacles
         self._cells_stay_free = territory_of(scenario).given_up_cells_stay_free
         self._scenario = scenario
         self._lattice = scenario.lattice
         self._queue_m = queue_pitch_m(scenario)
         self._any = False
         self._temporary = NO_PARTS
-        self._ends: dict[LanePosition, LaneEnd] = {}
-        """Dead ends by lane and end; those that have vanished as long as vehicles wait there."""
-        self._sections: tuple[LaneSection, ...] = ()
-        """Those of the road, up to the stop lines in them."""
-        self._columns, self._distance_m, self._room_m = 0, 0.0, 0.0
         self._gaps: dict[LanePosition, list[Gap]] = {}
-        self.still_closed: Callable[[float], Sequence[TemporaryClosure]] = lambda _: ()
-        """Returns the parts that are closed for a time whose cause lasts, as far as is known, at a
-        road time."""
         self._last_gap_column: dict[int, float] = {}
         """Rearmost column of the last gap, by entry point."""
+        self._last_passing_gap = math.inf
+        """Rearmost column of the last gap in a lane in which vehicles pass closed parts."""
         self._entered_gaps: list[range] = []
         """Columns of gaps that vehicles have entered, since they were last taken."""
         self._end_of: dict[Name, LanePosition | None] = {}
@@ -113,33 +102,18 @@ class LaneEndControl:
             lane_ends: those of the road, and of parts that are closed for a time, which may
                 vanish only when no vehicle waits there (`in_use`).
         """
-        scenario, self._temporary = self._scenario, lane_ends.temporary
-        self._ends = {(end.lane, end.end_m): end for end in lane_ends}
-        self._any = bool(lane_ends)
-        if self._ends:
-            needed = re_entry(scenario)
-            self._columns, self._room_m = needed.columns, needed.room_m
-            self._distance_m = needed.distance_m
-        closed = self._temporary.closed
-        self._sections = sections_to_lines(scenario, closed) if self._ends else ()
+        self._any, self._temporary = bool(lane_ends), lane_ends.temporary
+        self._restarts = Restarts(self._scenario, self._obstacles, lane_ends)
         # In a lane, those ahead get gaps first.
-        farthest_first = sorted(self._ends, key=lambda at: (at[0], -at[1]))
+        farthest_first = sorted(self._restarts.ends, key=lambda at: (at[0], -at[1]))
         before, self._gaps = self._gaps, {at: [] for at in farthest_first}
         for at, gaps in before.items():
-            merged = self._merged(at)
+            merged = self._restarts.merged(at)
             if merged is not None:
                 self._gaps[merged] += gaps
         for name, its_end in self._end_of.items():
             if its_end is not None:
-                self._end_of[name] = self._merged(its_end)
-
-    def _merged(self, at: LanePosition) -> LanePosition | None:
-        """Return an end, or that of the part before it, into which its own part has merged."""
-        if at in self._ends:
-            return at
-        lane, end_m = at
-        ends = (end for end in self._ends.values() if end.lane == lane)
-        return next(((lane, end.end_m) for end in ends if end.end_m <= end_m < end.reopens_m), None)
+                self._end_of[name] = self._restarts.merged(its_end)
 
     @property
     def in_use(self) -> set[LanePosition]:
@@ -168,28 +142,75 @@ class LaneEndControl:
         for name, vehicle in vehicles.items():
             yield from self._leave(name, vehicle, t_s)
         for at, gaps in self._gaps.items():
-            waiting = self._waiting(at, vehicles)
-            startable = [one for one in waiting if self._may_start(at, one, t_s)]
-            if startable and not self._blocking(startable[0], at, vehicles):
-                usable = [gap for gap in gaps if self._may_take(gap, at, startable[0], t_s)]
-                yield from self._start(startable[0], usable, t_s)
-                waiting = self._waiting(at, vehicles)
-            startable = [one for one in waiting if self._may_start_at_gap(at, one)]
             yield from self._arrive(gaps, vehicles, t_s)
-            blocking = self._blocking(startable[0], at, vehicles) if startable else []
-            if not all(self._may_start_at_gap(its_end, one) for its_end, one in blocking):
-                startable = []
-            last_m = max([self._ends[at].line_m, *(one.state[0] for one in startable[:1])])
-            gaps[:] = [gap for gap in gaps if gap.vehicle or not self._is_over(gap, last_m, t_s)]
-            free = [gap for gap in gaps if gap.vehicle is None]
-            ahead_m = min((one.state[0] for _, one in blocking), default=-math.inf)
-            for vehicle in startable:
-                own = next((gap for gap in free if self._will_take(gap, at, vehicle)), None)
-                if own is None:
-                    self._request(at, vehicle, gaps, t_s, ahead_m)
-                    break
-                free.remove(own)
-                ahead_m = vehicle.state[0]
+            in_order = self._in_order(self._waiting(at, vehicles), vehicles, t_s)
+            assigned = list(self._assign(in_order, gaps, vehicles, t_s))
+            used = [gap for _, gap in assigned if gap is not None]
+            line_m = self._restarts.ends[at].line_m
+            gaps[:] = [
+                gap
+                for gap in gaps
+                if gap.vehicle or gap in used or not self._has_passed(gap, line_m, t_s)
+            ]
+            for one, gap in assigned:
+                if gap is None:
+                    self._request(one, vehicles, t_s)
+                elif self._can_start(one, gap, vehicles, t_s):
+                    yield self._start(one, gap, t_s)
+
+    def _in_order(
+        self, waiting: list[Waiting], vehicles: Mapping[Name, RoadVehicle], t_s: float
+    ) -> list[Waiting]:
+        """Return the vehicles at a dead end in the order in which they get gaps.
+
+        Those between the line and a part that is closed get theirs last, which are long and cost
+        others time, unless they leave no room to those behind them.
+        """
+        last = [one for one in waiting if self._restarts.is_beyond_line(one, t_s)]
+        first = [one for one in waiting if one not in last]
+        at_line = [one for one in first if one.s_m < min(each.s_m for each in last)] if last else []
+        if not at_line or any(one in last for one in self._blocking(at_line[0], vehicles, t_s)):
+            return waiting
+        return first + last
+
+    def _assign(
+        self,
+        waiting: Iterable[Waiting],
+        gaps: Iterable[Gap],
+        vehicles: Mapping[Name, RoadVehicle],
+        t_s: float,
+    ) -> Iterator[tuple[Waiting, Gap | None]]:
+        """Yield the vehicles at a dead end that can start when a gap passes, and their gaps.
+
+        Of those that have none, only the first one is yielded. A vehicle behind one that has a gap
+        gets one on the assumption that the other one has started.
+        """
+        free = [gap for gap in gaps if gap.vehicle is None]
+        before: Waiting | None = None
+        given: set[Name] = set()
+        requested = False
+        for one in waiting:
+            then = one if before is None or before.s_m < one.s_m else one.behind(before)
+            before = None
+            gap = next((gap for gap in free if self._will_take(gap, then, t_s)), None)
+            if gap is None and (requested or not self._may_start_at_gap(then)):
+                continue
+            at_s = self._gap_arrives_s(one.at[0], then)
+            if gap is not None:
+                at_s = self._lattice.passing_time_s(gap.columns[-1], one.s_m)
+            if not all(
+                each.vehicle.name in given or (each.at != one.at and self._may_start_at_gap(each))
+                for each in self._blocking(then, vehicles, at_s)
+            ):
+                continue
+            if gap is None:
+                requested = True
+                yield then, None
+            else:
+                yield one, gap
+                free.remove(gap)
+                given.add(one.vehicle.name)
+                before = then
 
     def _leave(self, name: Name, vehicle: RoadVehicle, t_s: float) -> Iterator[LaneEndChange]:
         """Take a vehicle off the lattice, or back into its own lane, where a lane has ended."""
@@ -202,7 +223,7 @@ class LaneEndControl:
             yield self.take_off(name, vehicle)
         elif controller.off_lattice is OffLatticePhase.WAITING:
             # Parts that are closed for a time come and go ahead of it.
-            self._end_of[name] = self._end_ahead(controller.hold_cell[1], vehicle.state[0])
+            self._end_of[name] = self._restarts.end_ahead(controller.hold_cell[1], vehicle.state[0])
 
     def bodies(self, vehicles: Mapping[Name, RoadVehicle], t_s: float) -> dict[Name, OffLattice]:
         """Return the lane and the rear of each vehicle without cells, where plans must expect it.
@@ -212,9 +233,9 @@ class LaneEndControl:
         no plan leads into the gap, and those behind it will never be nearer to the vehicle.
         """
         found: dict[Name, OffLattice] = {}
-        for at, end in self._ends.items():
-            for number, vehicle in enumerate(self._waiting(at, vehicles)):
-                front_m, speed_mps = vehicle.state[:2]
+        for at, end in self._restarts.ends.items():
+            for number, one in enumerate(self._waiting(at, vehicles)):
+                vehicle, (front_m, speed_mps) = one.vehicle, one.vehicle.state[:2]
                 if speed_mps > STANDING_MPS or not vehicle.controller.stays:
                     front_m = max(front_m, end.line_m - number * self._queue_m)
                 rear_m = front_m - vehicle.size[0]
@@ -231,240 +252,165 @@ class LaneEndControl:
                 found[name] = OffLattice(lane, rear_m)
         return found
 
-    def _request(
-        self,
-        at: LanePosition,
-        vehicle: RoadVehicle,
-        gaps: list[Gap],
-        t_s: float,
-        ahead_m: float,
-    ) -> None:
-        """Keep the next columns free for a vehicle, unless the last gap was too close ahead.
-
-        Args:
-            at: dead end at which the vehicle waits.
-            vehicle: the vehicle.
-            gaps: those of the dead end.
-            t_s: road time.
-            ahead_m: front of the vehicle that gets the gap before; -inf: there is none.
-        """
-        arrives_s = self._gap_arrives_s(at[0], vehicle)
-        own = self._starts_in_own_lane(at, vehicle, arrives_s)
-        lane = at[0] if own else self._beside(at, vehicle, arrives_s)
-        if lane is None or (
-            not own and lane != self._beside(at, vehicle, self._gap_arrives_s(lane, vehicle))
-        ):
-            return  # SUMO takes the vehicle back, or it waits until a lane is open
-        # Behind the first entry point of the lane, vehicles may own its cells.
-        point = lane
-        taken = self._meter.points_kept_free(point)
-        if own:
+    def _request(self, one: Waiting, vehicles: Mapping[Name, RoadVehicle], t_s: float) -> None:
+        """Keep the next columns of a lane free for a vehicle, unless gaps are too close ahead."""
+        lane = one.at[0]
+        arrives_s = self._gap_arrives_s(lane, one)
+        if self._restarts.starts_in_own_lane(one, arrives_s):
             # Others enter the lane only behind it. The vehicle ahead must have started before the
             # gap arrives. The gap before needs the longer to that vehicle the farther ahead it is.
-            between = math.ceil(max(ahead_m - vehicle.state[0], 0.0) / self._lattice.pitch_m)
-        else:
-            between = self._columns_between_gaps(taken, t_s)
-        # No vehicle passes a part in the lane of the part; it may pass parts of other lanes there.
-        passes_parts = not own or any(part.lane != lane for part in self._temporary.closed)
-        last = self._last_gap_column.get(point, math.inf)
-        if self._meter.next_column(point) < last - between:
-            columns = self._meter.keep_free(point, self._columns, t_s, passes_parts=passes_parts)
-            self._last_gap_column |= dict.fromkeys(taken, columns[0])
-            gaps.append(Gap(lane, columns))
+            blocking = self._blocking(one, vehicles, arrives_s)
+            ahead_m = min((each.s_m for each in blocking), default=-math.inf)
+            between = math.ceil(max(ahead_m - one.s_m, 0.0) / self._lattice.pitch_m)
+            # No vehicle passes a part in its lane; it may pass parts of other lanes there.
+            passes_parts = any(part.lane != lane for part in self._temporary.closed)
+            columns = self._restarts.needed.columns
+            if self._meter.next_column(lane) < self._last_gap_column.get(lane, math.inf) - between:
+                self._keep_free(one, lane, columns, t_s, passes_parts=passes_parts)
+            return
+        # SUMO may take the vehicle back, or no lane is open yet.
+        lanes = self._restarts.lanes_beside(one, arrives_s)
+        for lane in sorted(lanes, key=self._meter.next_column, reverse=True):
+            needed = self._restarts.needed_by(one, arrives_s := self._gap_arrives_s(lane, one))
+            if (
+                needed is not None
+                and lane in self._restarts.lanes_beside(one, arrives_s)
+                and self._is_spaced(lane, needed.columns, t_s)
+            ):
+                self._keep_free(one, lane, needed.columns, t_s, passes_parts=True)
+                return
 
-    def _columns_between_gaps(self, points: Collection[int], t_s: float) -> int:
-        """Return the minimum number of columns between two gaps of a lane.
+    def _keep_free(
+        self, one: Waiting, lane: int, count: int, t_s: float, *, passes_parts: bool
+    ) -> None:
+        # Behind the first entry point of the lane, vehicles may own its cells.
+        columns = self._meter.keep_free(lane, count, t_s, passes_parts=passes_parts)
+        points = self._meter.points_kept_free(lane)
+        self._last_gap_column |= dict.fromkeys(points, columns[0])
+        if passes_parts:
+            self._last_passing_gap = columns[0]
+        self._gaps[one.at].append(Gap(lane, columns))
+
+    def _is_spaced(self, lane: int, columns: int, t_s: float) -> bool:
+        """Return whether a gap is far enough from the last ones for the other traffic.
 
         See `CROWDED_GAPS` and `USED_SHARE`.
 
         Args:
-            points: entry points whose vehicles cannot enter the columns of a gap.
+            lane: lane of the gap.
+            columns: number of its columns.
             t_s: road time.
         """
-        columns, open_lanes = self._columns, self._meter.most_in_column
-        min_columns, max_columns = OPEN_GAPS * columns, CROWDED_GAPS * columns
-        waiting = self._meter.waiting
-        if any(open_lanes is not None or one.entry_point in points for one in waiting):
-            return max_columns
+        points, open_lanes = self._meter.points_kept_free(lane), self._meter.most_in_column
+        in_lane, in_all, most = OPEN_GAPS * columns, 0, CROWDED_GAPS * columns
         if open_lanes is None:
-            return min_columns
-        spare_cells = USED_SHARE * open_lanes - self._meter.vehicles_in_column(t_s)
-        gap_cells = columns * min(len(points), open_lanes)
-        if gap_cells >= spare_cells * (columns + max_columns):
-            return max_columns
-        return max(min_columns, math.ceil(gap_cells / spare_cells) - columns)
-
-    def _gap_arrives_s(self, lane: int, vehicle: RoadVehicle) -> float:
-        """Return the road time at which the next gap of a lane would begin to pass a vehicle."""
-        return self._lattice.passing_time_s(self._meter.next_column(lane), vehicle.state[0])
-
-    def _is_open(self, at: LanePosition, vehicle: RoadVehicle, at_s: float) -> bool:
-        """Return whether a vehicle can drive on in its lane at a road time, beyond a dead end.
-
-        The causes of all that is closed there are over, or its body is beyond.
-        """
-        end, s_m = self._ends[at], vehicle.state[0]
-        return s_m >= end.reopens_m or (
-            end.sudden
-            and not any(
-                part.lane == end.lane and s_m < part.to_m and part.from_m < end.reopens_m
-                for part in self.still_closed(at_s)
-            )
-        )
-
-    def _open_lanes(self, vehicle: RoadVehicle, at_s: float) -> list[int]:
-        """Return the lanes of a body in which it can drive on beyond the next dead end."""
-        ahead = {lane: self._end_ahead(lane, vehicle.state[0]) for lane in vehicle.lanes_used}
-        return [lane for lane, at in ahead.items() if at and self._is_open(at, vehicle, at_s)]
-
-    def _later(self, at: LanePosition, vehicle: RoadVehicle) -> Iterator[LaneEnd]:
-        """Yield the dead ends of a lane after one of them, ahead of a body."""
-        end, s_m = self._ends[at], vehicle.state[0]
-        for other in self._ends.values():
-            if other.lane == end.lane and other.end_m > end.end_m and s_m < other.reopens_m:
-                yield other
-
-    def _starts_in_own_lane(self, at: LanePosition, vehicle: RoadVehicle, at_s: float) -> bool:
-        """Return whether a vehicle may start in its own lane at a road time, from where it waits.
-
-        The lane is open, and the vehicle settles before the line of the next dead end.
-        """
-        settles_m = max(self._ends[at].reopens_m, vehicle.state[0]) + self._distance_m
-        return self._is_open(at, vehicle, at_s) and all(
-            other.line_m >= settles_m for other in self._later(at, vehicle)
-        )
-
-    def _beside(self, at: LanePosition, vehicle: RoadVehicle, at_s: float) -> int | None:
-        """Return the lane into which a vehicle at a dead end re-enters at a road time, if any.
-
-        It needs room in its own lane until it is out of it.
-        """
-        end, s_m = self._ends[at], vehicle.state[0]
-        if end.taken_back:
-            return None
-        if not self._is_before_line(at, vehicle):
-            room_m = min((one.end_m for one in self._later(at, vehicle)), default=math.inf) - s_m
-            if room_m < self._room_m or not self._is_open(at, vehicle, at_s):
-                return None
-            starts_m = s_m
+            if any(one.entry_point in points for one in self._meter.waiting):
+                in_lane = most
+        elif self._meter.waiting:
+            in_lane = in_all = most
         else:
-            # Without a part that is closed for a time, it drives up to the line.
-            starts_m = min(s_m, end.line_m) if vehicle.controller.stays else end.line_m
-        return lane_beside(self._scenario, end.lane, starts_m, self._sections)
+            spare_cells = USED_SHARE * open_lanes - self._meter.vehicles_in_column(t_s)
+            gap_cells = columns * min(len(points), open_lanes)
+            is_full = gap_cells >= spare_cells * (columns + most)
+            in_all = most if is_full else max(0, math.ceil(gap_cells / spare_cells) - columns)
+        next_column, last = self._meter.next_column(lane), self._last_gap_column.get(lane, math.inf)
+        return next_column < min(last - max(in_lane, in_all), self._last_passing_gap - in_all)
 
-    def _is_before_line(self, at: LanePosition, vehicle: RoadVehicle) -> bool:
-        """Return whether a vehicle waits at the stop line before a dead end, or before it."""
-        return vehicle.state[0] <= self._ends[at].line_m + NEAR_LINE_M
+    def _gap_arrives_s(self, lane: int, one: Waiting) -> float:
+        """Return the road time at which the next gap of a lane would begin to pass a vehicle."""
+        return self._lattice.passing_time_s(self._meter.next_column(lane), one.s_m)
 
-    def _may_start(self, at: LanePosition, vehicle: RoadVehicle, at_s: float) -> bool:
-        """Return whether a vehicle that waits may start at a road time, and has room to start.
-
-        One that has broken down may start in its own lane once it is repaired.
-        """
-        breaks_down = vehicle.controller.broken_mps2 is not None
-        if breaks_down and vehicle.state[1] > STANDING_MPS:
-            return False
-        return self._starts_in_own_lane(at, vehicle, at_s) or (
-            not breaks_down
-            and (self._is_before_line(at, vehicle) or self._beside(at, vehicle, at_s) is not None)
-        )
-
-    def _may_start_at_gap(self, at: LanePosition, vehicle: RoadVehicle) -> bool:
+    def _may_start_at_gap(self, one: Waiting) -> bool:
         """Return whether a vehicle may start when the next gap would pass it.
 
         So those that wait for a part whose end is known get gaps that arrive soon after it.
         """
-        return self._may_start(at, vehicle, self._gap_arrives_s(at[0], vehicle))
+        return self._restarts.may_start(one, self._gap_arrives_s(one.at[0], one))
 
-    def _may_take(self, gap: Gap, at: LanePosition, vehicle: RoadVehicle, at_s: float) -> bool:
-        """Return whether a vehicle can start into a gap at a road time from where it waits."""
-        if gap.lane == at[0]:
-            return self._starts_in_own_lane(at, vehicle, at_s)
-        return gap.lane == self._beside(at, vehicle, at_s)
-
-    def _will_take(self, gap: Gap, at: LanePosition, vehicle: RoadVehicle) -> bool:
-        """Return whether a vehicle can start into a gap when it passes."""
-        passes_s = self._lattice.passing_time_s(gap.columns[-1], vehicle.state[0])
-        return self._may_take(gap, at, vehicle, passes_s)
+    def _will_take(self, gap: Gap, one: Waiting, t_s: float) -> bool:
+        """Return whether a vehicle can start into a gap when it passes, and it has not passed."""
+        at_s = max(t_s, self._lattice.passing_time_s(gap.columns[-1], one.s_m))
+        return (
+            not self._has_passed(gap, one.s_m, t_s)
+            and self._restarts.may_start(one, at_s)
+            and self._restarts.may_take(gap.lane, len(gap.columns), one, at_s)
+        )
 
     def take_off(self, name: Name, vehicle: RoadVehicle) -> LaneEndChange:
         """Take a vehicle off the lattice that has broken down, or whose lane ends."""
         self._forget(name)
         vehicle.controller.leave_lattice()
         lane = vehicle.controller.hold_cell[1]
-        at = self._end_of[name] = self._end_ahead(lane, vehicle.state[0])
-        vehicle.controller.stays = at is not None and self._ends[at].sudden
+        at = self._end_of[name] = self._restarts.end_ahead(lane, vehicle.state[0])
+        vehicle.controller.stays = at is not None and self._restarts.ends[at].sudden
         return LaneEndChange(name, LEFT_LATTICE, lane)
 
-    def _end_ahead(self, lane: int, s_m: float) -> LanePosition | None:
-        """Return the first dead end of a lane that a body has not passed, or else the last one."""
-        ends = [at for at in self._ends if at[0] == lane]
-        ahead = (at for at in ends if s_m < self._ends[at].reopens_m)
-        return next(ahead, ends[-1] if ends else None)
-
     def _blocking(
-        self, vehicle: RoadVehicle, at: LanePosition, vehicles: Mapping[Name, RoadVehicle]
-    ) -> list[tuple[LanePosition, RoadVehicle]]:
-        """Return the vehicles that leave a vehicle no room to start, with their dead ends.
+        self, one: Waiting, vehicles: Mapping[Name, RoadVehicle], at_s: float
+    ) -> list[Waiting]:
+        """Return the vehicles that leave a vehicle no room to start.
 
         They wait ahead of it, at the same dead end or the next ones.
         """
-        s_m = vehicle.state[0]
+        needed = self._restarts.needed_by(one, at_s) or self._restarts.needed
         return [
-            (its_end, one)
-            for its_end in self._ends
-            if its_end[0] == at[0]
-            for one in self._waiting(its_end, vehicles)
-            if one.state[0] > s_m and one.state[0] - one.size[0] - s_m < self._room_m
+            each
+            for its_end in self._restarts.ends
+            if its_end[0] == one.at[0]
+            for each in self._waiting(its_end, vehicles)
+            if each.s_m > one.s_m and each.s_m - each.vehicle.size[0] - one.s_m < needed.room_m
         ]
 
-    def _waiting(self, at: LanePosition, vehicles: Mapping[Name, RoadVehicle]) -> list[RoadVehicle]:
+    def _waiting(self, at: LanePosition, vehicles: Mapping[Name, RoadVehicle]) -> list[Waiting]:
         """Return the vehicles that wait at a dead end, foremost first."""
         waiting = [
-            vehicles[name]
+            Waiting.of(vehicles[name], at)
             for name, its_end in self._end_of.items()
             if its_end == at
             and name in vehicles
             and vehicles[name].controller.off_lattice is OffLatticePhase.WAITING
         ]
-        return sorted(waiting, key=lambda vehicle: -vehicle.state[0])
+        return sorted(waiting, key=lambda one: -one.s_m)
 
-    def _start(
-        self, vehicle: RoadVehicle, gaps: Collection[Gap], t_s: float
-    ) -> Iterator[LaneEndChange]:
-        """Let the foremost waiting vehicle re-enter if a gap is passing it."""
-        s_m, speed_mps = vehicle.state[0], vehicle.state[1]
-        if speed_mps > STANDING_MPS:
-            return
-        settles_s = 2.0 * self._distance_m / self._lattice.speed_mps
-        for gap in gaps:
-            if any(
-                part.lane == gap.lane
-                and part.speed_mps > STANDING_MPS  # at rest, it may wait for this vehicle
-                and part.at(t_s)[0] < s_m + self._distance_m
-                and part.at(t_s + settles_s)[1] > s_m - vehicle.size[0]
-                for part in self._temporary.cleared
-            ):
-                continue  # for a fast vehicle of another system
-            passed_s = t_s - self._lattice.passing_time_s(gap.columns[-1], s_m)
-            if gap.vehicle is None and 0.0 <= passed_s <= START_S and self._is_free(vehicle, gap):
-                gap.vehicle = vehicle.name
-                # Weak types need more columns than strong ones, which arrive earlier.
-                limits = self._scenario.types[vehicle.arrival.vehicle_type].limits
-                own = own_re_entry(self._scenario, limits)
-                cell = gap.columns[-own.columns], gap.lane
-                vehicle.controller.re_enter(cell, self._open_lanes(vehicle, t_s))
-                yield LaneEndChange(vehicle.name, DRIVES_OUT, gap.lane)
-                return
+    def _can_start(
+        self, one: Waiting, gap: Gap, vehicles: Mapping[Name, RoadVehicle], t_s: float
+    ) -> bool:
+        """Return whether a waiting vehicle can start into a gap now, which is passing it."""
+        passed_s = t_s - self._lattice.passing_time_s(gap.columns[-1], one.s_m)
+        if (
+            one.vehicle.state[1] > STANDING_MPS
+            or not 0.0 <= passed_s <= START_S
+            or not self._restarts.may_start(one, t_s)
+            or not self._restarts.may_take(gap.lane, len(gap.columns), one, t_s)
+            or self._blocking(one, vehicles, t_s)
+        ):
+            return False
+        distance_m = self._restarts.into(gap.lane, one, t_s).distance_m
+        settles_s = 2.0 * distance_m / self._lattice.speed_mps
+        return self._is_free(one.vehicle, gap, distance_m) and not any(
+            part.lane == gap.lane
+            and part.speed_mps > STANDING_MPS  # at rest, it may wait for this vehicle
+            and part.at(t_s)[0] < one.s_m + distance_m
+            and part.at(t_s + settles_s)[1] > one.s_m - one.vehicle.size[0]
+            for part in self._temporary.cleared  # for a fast vehicle of another system
+        )
 
-    def _is_free(self, vehicle: RoadVehicle, gap: Gap) -> bool:
+    def _start(self, one: Waiting, gap: Gap, t_s: float) -> LaneEndChange:
+        """Let a waiting vehicle re-enter into a gap."""
+        vehicle = one.vehicle
+        gap.vehicle = vehicle.name
+        cell = gap.columns[-self._restarts.into(gap.lane, one, t_s).columns], gap.lane
+        vehicle.controller.re_enter(cell, self._restarts.passable_lanes(vehicle, t_s))
+        return LaneEndChange(vehicle.name, DRIVES_OUT, gap.lane)
+
+    def _is_free(self, vehicle: RoadVehicle, gap: Gap, distance_m: float) -> bool:
         """Return whether the sensors of a vehicle show that a gap is free."""
         neighbours = vehicle.controller.neighbours
         # The vehicle behind is a column behind the rearmost of the gap.
         behind_m = (len(gap.columns) - 1) * self._lattice.pitch_m - vehicle.size[0]
         slow_mps = 0.5 * self._lattice.speed_mps
         return all(
-            other.gap_m > (BESIDE_M if other.speed_mps > slow_mps else self._distance_m)
+            other.gap_m > (BESIDE_M if other.speed_mps > slow_mps else distance_m)
             for other in neighbours.ahead
             if other.lane == gap.lane
         ) and all(
@@ -489,9 +435,9 @@ class LaneEndControl:
             self._entered_gaps.append(gap.columns)
             yield LaneEndChange(name, ENTERED_LATTICE, gap.lane)
 
-    def _is_over(self, gap: Gap, last_m: float, t_s: float) -> bool:
-        """Return whether all of a gap has passed the line, and the first vehicle that may start."""
-        return t_s > self._lattice.passing_time_s(gap.columns[-1], last_m) + START_S
+    def _has_passed(self, gap: Gap, s_m: float, t_s: float) -> bool:
+        """Return whether it is too late to start into a gap at a position."""
+        return t_s > self._lattice.passing_time_s(gap.columns[-1], s_m) + START_S
 
     def _forget(self, name: Name) -> None:
         """Forget a vehicle, and the gap into which it drives."""

@@ -19,7 +19,8 @@ from attrs import define, frozen
 from laneweave.protocol.road_layout import LanePosition, TemporaryClosure, TemporaryParts
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.road_tables import RoadEvent
-from laneweave.protocol.vehicle.lane_ends import LaneEnds, re_entry, stop_line_m
+from laneweave.protocol.vehicle.lane_ends import LaneEnds, stop_line_m
+from laneweave.protocol.vehicle.re_entry import re_entry
 from laneweave.protocol.vehicle.sudden_stops import (
     begins_m,
     queue_pitch_m,

@@ -26,7 +26,7 @@ from laneweave.protocol.runtime.queries import (
 )
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.road_tables import RoadEvent
-from laneweave.protocol.vehicle.lane_ends import re_entry
+from laneweave.protocol.vehicle.re_entry import re_entry
 from laneweave.protocol.wire.messages import Name
 from laneweave.protocol.wire.obstacle_messages import BREAKDOWN, CLOSED
 from laneweave.protocol.wire.road_requests import (

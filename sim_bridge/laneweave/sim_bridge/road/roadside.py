@@ -159,10 +159,9 @@ class Roadside:
             shared_lanes=scenario.geometry.shared_lanes,
             is_free=self._allocation.is_free,
         )
-        self._lane_ends = LaneEndControl(scenario, self._meter)
         self._scenario = scenario
         self.obstacles = Obstacles(scenario, breakdowns)
-        self._lane_ends.still_closed = self.obstacles.still_closed
+        self._lane_ends = LaneEndControl(scenario, self._meter, self.obstacles)
         self._temporary = NO_PARTS
         self._told: tuple[Obstacle, ...] = ()
         """Obstacles of which events have been logged."""

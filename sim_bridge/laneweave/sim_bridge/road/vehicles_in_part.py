@@ -8,8 +8,8 @@ from typing import Protocol
 from attrs import frozen
 
 from laneweave.protocol.scenario.fields import Scenario
-from laneweave.protocol.vehicle.lane_ends import re_entry
 from laneweave.protocol.vehicle.motion import State
+from laneweave.protocol.vehicle.re_entry import re_entry
 from laneweave.protocol.vehicle.sudden_stops import room_before_part_m
 from laneweave.protocol.wire.messages import Name
 

@@ -31,7 +31,7 @@ from laneweave.protocol.road_layout import ANY_LANE, ClearedPart, TemporaryClosu
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.formation_table import DrivingStructure, FormationSettings
 from laneweave.protocol.scenario.road_tables import Closure, Entrance, Exit, Road
-from laneweave.protocol.vehicle.lane_ends import re_entry
+from laneweave.protocol.vehicle.re_entry import re_entry
 from laneweave.protocol.wire.messages import Census, CensusEntry, Name, OffLattice
 
 ROOM_M = re_entry(Scenario(road=Road(closures=(Closure(0, 800.0),)))).room_m

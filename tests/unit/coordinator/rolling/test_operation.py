@@ -31,7 +31,7 @@ from laneweave.protocol.road_layout import TemporaryClosure, TemporaryParts
 from laneweave.protocol.runtime.node import Compute, Computed
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.formation_table import READY_LATE_S, SNAPSHOT_S
-from laneweave.protocol.vehicle.lane_ends import re_entry
+from laneweave.protocol.vehicle.re_entry import re_entry
 from laneweave.protocol.wire.events import PLANNING_FAILED, PLANNING_LATE
 from laneweave.protocol.wire.messages import (
     Ballot,

@@ -19,7 +19,7 @@ from laneweave.launch.web import road_script
 from laneweave.protocol.road_layout import ANY_LANE
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.road_tables import Closure
-from laneweave.protocol.vehicle.lane_ends import re_entry
+from laneweave.protocol.vehicle.re_entry import re_entry
 from support.closed_lanes import BLOCKED, DROP, DROP_M
 from support.javascript import needs_node, printed_json
 from support.tables import for_each

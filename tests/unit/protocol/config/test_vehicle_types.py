@@ -14,7 +14,7 @@ from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import displacements
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.vehicle_types import VehicleType
-from laneweave.protocol.vehicle.lane_ends import own_re_entry, re_entry
+from laneweave.protocol.vehicle.re_entry import own_re_entry, re_entry
 from support.refusals import refusal
 from support.tables import for_each
 from support.variants import variants

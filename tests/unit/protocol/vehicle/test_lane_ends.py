@@ -29,11 +29,11 @@ from laneweave.protocol.vehicle.lane_ends import (
     LaneEnds,
     dead_ends,
     early_start_m,
-    lane_beside,
-    re_entry,
+    lanes_beside,
     sections_to_lines,
 )
 from laneweave.protocol.vehicle.motion import cell_state
+from laneweave.protocol.vehicle.re_entry import re_entry
 from laneweave.protocol.wire.messages import CurrentMotion, Neighbour
 from laneweave.sim_bridge.bodies.motion_controller import FallbackLevel, MotionController
 from support.closed_lanes import BLOCKED, DROP
@@ -172,22 +172,22 @@ def test_the_exit_before_does_not_end_moves_that_begin_before_the_lane_opens_aga
 @pytest.mark.parametrize(
     ("closures", "beside"),
     [
-        ((Closure(0, 800.0),), 1),
-        ((Closure(2, 800.0),), 1),
-        ((Closure(1, 800.0),), 2),
-        ((Closure(1, 800.0), Closure(2, 800.0)), 0),
-        ((Closure(0, 800.0), Closure(1, 800.0)), None),
-        ((Closure(0, 800.0), Closure(1, 960.0)), 1),  # it ends later than the vehicle needs it
+        ((Closure(0, 800.0),), (1,)),
+        ((Closure(2, 800.0),), (1,)),
+        ((Closure(1, 800.0),), (2, 0)),
+        ((Closure(1, 800.0), Closure(2, 800.0)), (0,)),
+        ((Closure(0, 800.0), Closure(1, 800.0)), ()),
+        ((Closure(0, 800.0), Closure(1, 960.0)), (1,)),  # it ends later than the vehicle needs it
     ],
 )
 def test_vehicles_drive_out_into_a_lane_that_is_open(
-    closures: tuple[Closure, ...], beside: int | None
+    closures: tuple[Closure, ...], beside: tuple[int, ...]
 ) -> None:
     scenario = with_closures(*closures)
     lane = closures[0].lane
     (end,) = (end for end in dead_ends(scenario) if end.lane == lane)
     sections = sections_to_lines(scenario)
-    assert lane_beside(scenario, end.lane, end.line_m, sections) == beside
+    assert lanes_beside(scenario, end.lane, end.line_m, sections) == beside
 
 
 # --- re-entry ---------------------------------------------------------------------------------

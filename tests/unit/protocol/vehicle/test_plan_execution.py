@@ -12,8 +12,9 @@ from msgspec.structs import replace
 from laneweave.protocol.lattice import Cell, Lattice, PlannedMove
 from laneweave.protocol.scenario.road_tables import Closure
 from laneweave.protocol.vehicle.execution_rules import VEHICLE_RULES, both_lanes_are_open
-from laneweave.protocol.vehicle.lane_ends import LATE_S, LaneEnds, early_start_m, re_entry
+from laneweave.protocol.vehicle.lane_ends import LATE_S, LaneEnds, early_start_m
 from laneweave.protocol.vehicle.plan_execution import LISTEN_S, ExecutionPhase, PlanExecution
+from laneweave.protocol.vehicle.re_entry import re_entry
 from laneweave.protocol.vehicle.territory import BlockTerritory
 from laneweave.protocol.wire.messages import (
     Ballot,

@@ -10,7 +10,8 @@ from attrs import evolve
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.road_tables import Closure, Demand
-from laneweave.protocol.vehicle.lane_ends import dead_ends, re_entry
+from laneweave.protocol.vehicle.lane_ends import dead_ends
+from laneweave.protocol.vehicle.re_entry import re_entry
 from laneweave.protocol.wire.events import DRIVES_OUT, ENTERED_LATTICE, LEFT_LATTICE
 from laneweave.protocol.wire.messages import Name, OffLattice
 from laneweave.sim_bridge.bodies.motion_controller import FallbackLevel

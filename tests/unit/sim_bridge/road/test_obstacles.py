@@ -11,7 +11,8 @@ from attrs import evolve
 
 from laneweave.protocol.road_layout import TemporaryClosure, TemporaryParts
 from laneweave.protocol.scenario.road_tables import Closure, Demand, RoadEvent
-from laneweave.protocol.vehicle.lane_ends import START_S, LaneEnds, re_entry
+from laneweave.protocol.vehicle.lane_ends import LaneEnds, stop_line_m
+from laneweave.protocol.vehicle.re_entry import START_S, re_entry
 from laneweave.protocol.vehicle.sudden_stops import room_before_part_m
 from laneweave.protocol.wire.events import (
     DRIVES_OUT,
@@ -22,7 +23,7 @@ from laneweave.protocol.wire.events import (
 )
 from laneweave.protocol.wire.messages import Name, OffLattice
 from laneweave.protocol.wire.obstacle_messages import BREAKDOWN, CLOSED, Obstacle
-from laneweave.sim_bridge.bodies.motion_controller import OffLatticePhase
+from laneweave.sim_bridge.bodies.motion_controller import FallbackLevel, OffLatticePhase
 from laneweave.sim_bridge.bodies.stop_lines import STANDING_MPS
 from laneweave.sim_bridge.road.entry import EntryMeter
 from laneweave.sim_bridge.road.lane_end_control import CROWDED_GAPS, OPEN_GAPS, Gap
@@ -150,6 +151,34 @@ def test_no_gap_is_kept_free_for_a_vehicle_that_is_never_repaired() -> None:
     assert names(road, ENTERED_LATTICE)
 
 
+@pytest.mark.parametrize(("volume", "seed"), variants([(1500.0, 2), (1800.0, 3)], 1))
+def test_nobody_waits_behind_a_vehicle_that_is_never_repaired(volume: float, seed: int) -> None:
+    check_that_nobody_waits_for_a_repair(volume, seed)
+
+
+def check_that_nobody_waits_for_a_repair(volume: float = 1500.0, seed: int = 2) -> None:
+    """Those that could not stop at the line drive out, too: slowly, and after those at the line."""
+    road = lonely_road(evolve(BREAKS_DOWN, for_s=math.inf), volume=volume, seed=seed)
+    beyond: dict[Name, float] = {}
+    while len(road.vehicles) > 1 or not road.roadside.demand.exhausted(road.t_s):
+        road.step()
+        assert road.t_s < END_S, f"still on the road: {sorted(road.vehicles)}"
+        assert road.overlaps == []
+        for one in road.roadside.obstacles.active:
+            line_m = stop_line_m(one.part, ROAD)
+            for name, vehicle in road.vehicles.items():
+                controller = vehicle.controller
+                if controller.off_lattice is OffLatticePhase.RE_ENTERING:
+                    assert controller.level is not FallbackLevel.EMERGENCY
+                elif name != one.vehicle and controller.stays and vehicle.state[0] > line_m + 1.0:
+                    beyond[name] = road.t_s
+    (broken,) = road.vehicles
+    assert len(beyond) >= 2
+    out = [name for _, kind, name in road.events if kind == DRIVES_OUT]
+    assert sorted(out) == [name for name in names(road, LEFT_LATTICE) if name != broken]
+    assert {*out[-len(beyond) :]} == {*beyond}
+
+
 def gaps_of(road: LonelyRoad) -> dict[int, list[Gap]]:
     """Return the gaps by lane."""
     found: dict[int, list[Gap]] = {}
@@ -160,16 +189,25 @@ def gaps_of(road: LonelyRoad) -> dict[int, list[Gap]]:
 
 
 @pytest.mark.parametrize(
-    ("volume", "least", "most"),
-    [(600.0, OPEN_GAPS, OPEN_GAPS + 1), (1800.0, CROWDED_GAPS - 1, CROWDED_GAPS)],
+    ("volume", "in_lane", "least", "most"),
+    [
+        (600.0, True, OPEN_GAPS, OPEN_GAPS + 1),
+        (600.0, False, 0, OPEN_GAPS),
+        (1800.0, False, CROWDED_GAPS - 1, CROWDED_GAPS),
+    ],
 )
-def test_gaps_leave_cells_for_the_vehicles_that_pass(volume: float, least: int, most: int) -> None:
+def test_gaps_leave_cells_for_the_vehicles_that_pass(
+    volume: float, least: int, most: int, *, in_lane: bool
+) -> None:
+    """Where there is room, they take turns in the lanes on both sides."""
     road = lonely_road(evolve(BREAKS_DOWN, for_s=math.inf), volume=volume)
-    seen: set[range] = set()
-    while len(seen) < 2:
+    seen: dict[int, set[range]] = {}
+    while all(len(gaps) < 2 for gaps in seen.values()):
         road.step()
-        seen |= {gap.columns for gaps in gaps_of(road).values() for gap in gaps}
-    ahead, behind = sorted(seen, key=lambda kept: -kept.start)
+        for lane, gaps in gaps_of(road).items():
+            seen.setdefault(lane if in_lane else 0, set()).update(gap.columns for gap in gaps)
+    (of_lane,) = (gaps for gaps in seen.values() if len(gaps) == 2)
+    ahead, behind = sorted(of_lane, key=lambda kept: -kept.start)
     columns = re_entry(ROAD).columns
     assert least * columns <= ahead.start - behind.stop <= most * columns
 
@@ -425,6 +463,7 @@ BUGS: tuple[Bug, ...] = (
     road_bugs.parts_are_closed_around_vehicles, road_bugs.gaps_end_at_the_line,
     road_bugs.entrances_stay_open, road_bugs.controllers_do_not_know,
     road_bugs.moves_into_closed_lanes_go_on, road_bugs.gaps_only_after_the_repair,
+    road_bugs.late_vehicles_wait_for_the_repair, road_bugs.late_vehicles_start_as_others,
 )  # fmt: skip
 
 
@@ -433,6 +472,7 @@ def check_all() -> None:
         run_to_end(make(), ENOUGH_S)
     check_that_those_at_the_line_drive_out_meanwhile()
     check_that_a_gap_passes_when_it_is_repaired()
+    check_that_nobody_waits_for_a_repair()
     check_that_one_whose_move_has_just_begun_drives_past()
     check_that_nobody_enters_while_all_lanes_are_closed()
 
