@@ -203,8 +203,10 @@ def line_forgotten_when_driving_out(patch: Patch) -> None:
     """The way out is blocked by the line at which the vehicle stands."""
     re_entry = MotionController.re_enter
 
-    def mutant(self: MotionController, cell: Cell, open_lanes: Iterable[int]) -> None:
-        re_entry(self, cell, open_lanes)
+    def mutant(
+        self: MotionController, cell: Cell, passable: Iterable[int], *, keeps_distance: bool
+    ) -> None:
+        re_entry(self, cell, passable, keeps_distance=keeps_distance)
         self.stop_lines.passed = False
 
     patch.setattr(MotionController, "re_enter", mutant)

@@ -261,7 +261,7 @@ def test_without_a_cell_it_begins_anew_and_only_keeps_its_claim() -> None:
         assert rig.hand(topics.PREPARE, Prepare(BALLOT, (0,), (ME,))) == []
         assert rig.hand(topics.PLAN, plan) == []
     there: Cell = (-5, 1)
-    controller.re_enter(there, ())
+    controller.re_enter(there, (), keeps_distance=False)
     controller.enter_lattice([there])
     rig.coast(1)
     (command,) = sent(rig.hand(topics.SENSE, rig.sense()), Command)
@@ -277,7 +277,7 @@ def test_it_begins_anew_if_its_vehicle_has_entered_the_lattice_again_unseen() ->
     rig.accept((0, HOME, (-1, 2)))
     controller, there = rig.controller, (-5, 1)
     controller.leave_lattice()
-    controller.re_enter(there, ())
+    controller.re_enter(there, (), keeps_distance=False)
     controller.enter_lattice([there])
     rig.coast(30)
     for _ in range(2):

@@ -255,11 +255,12 @@ class MotionController:
         self.store.give_up_cells()
         self._stop_motion()
 
-    def re_enter(self, cell: Cell, open_lanes: Iterable[int]) -> None:
+    def re_enter(self, cell: Cell, passable: Iterable[int], *, keeps_distance: bool) -> None:
         """Start from standstill towards a cell that is kept free; see `StopLinesAhead.start`."""
         self.off_lattice, self.hold_cell = OffLatticePhase.RE_ENTERING, cell
         self.broken_mps2, self.stays = None, False
-        self.stop_lines.start(cell[1], open_lanes, self.measured[0])
+        s_m = self.measured[0]
+        self.stop_lines.start(cell[1], passable, s_m, keeps_distance=keeps_distance)
         self._stop_motion()
 
     def enter_lattice(self, cells: Iterable[Cell]) -> None:
@@ -447,8 +448,7 @@ class MotionController:
                 other.speed_mps + lag_s * other.accel_mps2,
             )
             for other in near
-            # A vehicle that starts into another lane brakes for the end of its own only if it must.
-            if not self.stop_lines.passed or other.lane == goal_lane
+            if self.stop_lines.brakes_early(other.lane, goal_lane)
         ]
         min_gap_m = self._scenario.tracking.min_gap_m
         careful = keep_gap(state, jerk, ahead, limits, min_gap_m, self.tick_s)

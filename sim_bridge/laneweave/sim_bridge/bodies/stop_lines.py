@@ -30,13 +30,17 @@ class StopLinesAhead:
     _limits: Vehicle
     lane_ends: LaneEnds = Factory(lambda self: LaneEnds(self._scenario), takes_self=True)
     passed: bool = False
-    """Whether the vehicle has started from standing at a stop line."""
+    """Whether the vehicle has started from standing, so that in the lane that it leaves the end
+    counts, not the stop line, and it brakes for what is ahead there only if it must."""
+    keeps_distance: bool = False
+    """Whether it has started slowly: it keeps its distance to what is ahead there all the same."""
     _kept_out_of: Cell | None = None
     """Cell in a lane that has ended, which the body may not enter; see `keep_out`."""
     taken_back: Cell | None = None
     """Target of a move that was taken back, which its process may repeat until it learns of it."""
     _past: dict[int, LaneEnd] = field(factory=dict)
-    """Beginnings of parts that are open again, by lane: it has started there, and passes them."""
+    """Beginnings of parts by lane that it passes, since it has started there: they are open again,
+    or only vehicles, which it senses, are in them."""
 
     def keep_out(
         self,
@@ -72,19 +76,29 @@ class StopLinesAhead:
         self._kept_out_of = hold_cell if kept_out else None
         return kept_out
 
-    def start(self, goal: int, open_lanes: Iterable[int], s_m: float) -> None:
+    def start(
+        self, goal: int, passable: Iterable[int], s_m: float, *, keeps_distance: bool
+    ) -> None:
         """Start from standing towards a lane.
 
         Args:
             goal: the lane.
-            open_lanes: lanes that the body touches in which it may drive past the next dead end.
+            passable: lanes that the body touches in which it may drive past the next dead end.
             s_m: position of the body.
+            keeps_distance: whether it starts slowly; see `re_entry_behind`.
         """
-        self.passed = True
-        for lane in open_lanes:
+        self.passed, self.keeps_distance = True, keeps_distance
+        for lane in passable:
             end = self.lane_ends.ahead(lane, s_m)
             if end is not None and end.sudden and (goal == lane or s_m > end.line_m + NEAR_LINE_M):
                 self._past[lane] = end
+
+    def brakes_early(self, lane: int, goal: int) -> bool:
+        """Return whether a vehicle with a goal lane keeps its distance to what is ahead in a lane.
+
+        One that starts into another lane brakes for the end of its own only if it must.
+        """
+        return not self.passed or self.keeps_distance or lane == goal
 
     def section_m(self, lane: int, s_m: float) -> float:
         """Return a position in the section of a lane whose end counts for a body there."""

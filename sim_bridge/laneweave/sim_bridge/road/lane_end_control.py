@@ -40,6 +40,8 @@ OPEN_GAPS, CROWDED_GAPS = 1, 5
 traffic, and vehicles that change into it, keep most of its cells; and the same while vehicles wait
 at the entrance of the lane or, while a part is closed for a time, at any entrance. With fewer, gaps
 would use up the capacity of dense traffic."""
+LAST_S = 60.0
+"""Time for which vehicles beyond a stop line get their gaps after those at the line."""
 USED_SHARE = 0.8
 """Share of the cells past closed parts that gaps and vehicles from the start of the road use
 together, as far as `CROWDED_GAPS` allows. With more, vehicles find no way out of the closed lane,
@@ -93,6 +95,8 @@ class LaneEndControl:
         """Columns of gaps that vehicles have entered, since they were last taken."""
         self._end_of: dict[Name, LanePosition | None] = {}
         """Dead end at which each vehicle without cells waits or waited; None: its lane has none."""
+        self._since_s: dict[Name, float] = {}
+        """Since when each of them has no cells."""
         self.close(LaneEnds(scenario))
 
     def close(self, lane_ends: LaneEnds) -> None:
@@ -141,16 +145,19 @@ class LaneEndControl:
             self._forget(name)
         for name, vehicle in vehicles.items():
             yield from self._leave(name, vehicle, t_s)
+        self._since_s = {name: self._since_s.get(name, t_s) for name in self._end_of}
         for at, gaps in self._gaps.items():
             yield from self._arrive(gaps, vehicles, t_s)
-            in_order = self._in_order(self._waiting(at, vehicles), vehicles, t_s)
+            waiting = self._waiting(at, vehicles)
+            in_order = self._in_order(waiting, vehicles, t_s)
             assigned = list(self._assign(in_order, gaps, vehicles, t_s))
             used = [gap for _, gap in assigned if gap is not None]
-            line_m = self._restarts.ends[at].line_m
+            able = (one.s_m for one in waiting if one.vehicle.controller.broken_mps2 is None)
+            last_m = max(self._restarts.ends[at].line_m, next(able, -math.inf))
             gaps[:] = [
                 gap
                 for gap in gaps
-                if gap.vehicle or gap in used or not self._has_passed(gap, line_m, t_s)
+                if gap.vehicle or gap in used or not self._has_passed(gap, last_m, t_s)
             ]
             for one, gap in assigned:
                 if gap is None:
@@ -163,10 +170,15 @@ class LaneEndControl:
     ) -> list[Waiting]:
         """Return the vehicles at a dead end in the order in which they get gaps.
 
-        Those between the line and a part that is closed get theirs last, which are long and cost
-        others time, unless they leave no room to those behind them.
+        Those between the line and a part that is closed get theirs last for a time, which are long
+        and cost others time, unless they leave no room to those behind them.
         """
-        last = [one for one in waiting if self._restarts.is_beyond_line(one, t_s)]
+        last = [
+            one
+            for one in waiting
+            if self._restarts.is_beyond_line(one, t_s)
+            and t_s < self._since_s[one.vehicle.name] + LAST_S
+        ]
         first = [one for one in waiting if one not in last]
         at_line = [one for one in first if one.s_m < min(each.s_m for each in last)] if last else []
         if not at_line or any(one in last for one in self._blocking(at_line[0], vehicles, t_s)):
@@ -182,10 +194,12 @@ class LaneEndControl:
     ) -> Iterator[tuple[Waiting, Gap | None]]:
         """Yield the vehicles at a dead end that can start when a gap passes, and their gaps.
 
-        Of those that have none, only the first one is yielded. A vehicle behind one that has a gap
-        gets one on the assumption that the other one has started.
+        Of those that have none, only the first one is yielded, as it will wait when those ahead
+        that have gaps have started.
         """
-        free = [gap for gap in gaps if gap.vehicle is None]
+        free = sorted(
+            (gap for gap in gaps if gap.vehicle is None), key=lambda gap: -gap.columns[-1]
+        )
         before: Waiting | None = None
         given: set[Name] = set()
         requested = False
@@ -193,7 +207,7 @@ class LaneEndControl:
             then = one if before is None or before.s_m < one.s_m else one.behind(before)
             before = None
             gap = next((gap for gap in free if self._will_take(gap, then, t_s)), None)
-            if gap is None and (requested or not self._may_start_at_gap(then)):
+            if gap is None and (requested or not self._may_start_at_gap(then.cautious)):
                 continue
             at_s = self._gap_arrives_s(one.at[0], then)
             if gap is not None:
@@ -205,7 +219,7 @@ class LaneEndControl:
                 continue
             if gap is None:
                 requested = True
-                yield then, None
+                yield then.cautious, None
             else:
                 yield one, gap
                 free.remove(gap)
@@ -270,7 +284,13 @@ class LaneEndControl:
             return
         # SUMO may take the vehicle back, or no lane is open yet.
         lanes = self._restarts.lanes_beside(one, arrives_s)
-        for lane in sorted(lanes, key=self._meter.next_column, reverse=True):
+        # The lane whose gap arrives first, or else the one that had no gap for the longest time.
+        last = self._last_gap_column
+        for lane in sorted(
+            lanes,
+            key=lambda lane: (self._meter.next_column(lane), last.get(lane, math.inf)),
+            reverse=True,
+        ):
             needed = self._restarts.needed_by(one, arrives_s := self._gap_arrives_s(lane, one))
             if (
                 needed is not None
@@ -399,8 +419,12 @@ class LaneEndControl:
         """Let a waiting vehicle re-enter into a gap."""
         vehicle = one.vehicle
         gap.vehicle = vehicle.name
-        cell = gap.columns[-self._restarts.into(gap.lane, one, t_s).columns], gap.lane
-        vehicle.controller.re_enter(cell, self._restarts.passable_lanes(vehicle, t_s))
+        needed = self._restarts.into(gap.lane, one, t_s)
+        vehicle.controller.re_enter(
+            (gap.columns[-needed.columns], gap.lane),
+            self._restarts.passable_lanes(vehicle, t_s),
+            keeps_distance=self._restarts.keeps_distance(gap.lane, one, t_s),
+        )
         return LaneEndChange(vehicle.name, DRIVES_OUT, gap.lane)
 
     def _is_free(self, vehicle: RoadVehicle, gap: Gap, distance_m: float) -> bool:

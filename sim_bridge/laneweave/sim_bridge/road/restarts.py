@@ -33,6 +33,8 @@ from laneweave.sim_bridge.bodies.stop_lines import STANDING_MPS
 from laneweave.sim_bridge.road.obstacles import Obstacles
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
 
+ROOM_ERROR_M = 1.0
+"""Room behind another vehicle that a vehicle need not have for a gap that was kept free for it."""
 SOON_S = 30.0
 """Time in which a part will be open so soon that a vehicle behind others waits for it: the longer
 gap that it would need costs vehicles in other lanes more."""
@@ -59,6 +61,11 @@ class Waiting:
     def s_m(self) -> float:
         """Position of its front."""
         return self.vehicle.state[0]
+
+    @property
+    def cautious(self) -> Waiting:
+        """This vehicle with the room that it has at least, in spite of measurement errors."""
+        return evolve(self, room_m=self.room_m - ROOM_ERROR_M)
 
     def behind(self, other: Waiting) -> Waiting:
         """Return this vehicle as it will wait when the one ahead of it has started."""
@@ -119,11 +126,11 @@ class Restarts:
         if lane == one.at[0]:
             return self.starts_in_own_lane(one, at_s)
         needed = self.needed_by(one, at_s)
-        return (
-            needed is not None
-            and columns >= needed.columns
-            and lane in self.lanes_beside(one, at_s)
-        )
+        if needed is None or columns < needed.columns:
+            return False
+        # A longer gap is for a vehicle that starts slowly.
+        fits = columns <= self.needed.columns or needed is not self.needed
+        return fits and lane in self.lanes_beside(one, at_s)
 
     def starts_in_own_lane(self, one: Waiting, at_s: float) -> bool:
         """Return whether a vehicle may start in its own lane at a road time, from where it waits.
@@ -156,30 +163,38 @@ class Restarts:
         """
         if self._is_before_line(one):
             return self.needed
+        end, vehicle = self.ends[one.at], one.vehicle
         room_m = min((each.end_m for each in self._later(one)), default=math.inf) - one.s_m
-        if not self._is_open(one.at, one.s_m, at_s):
-            if self.ends[one.at].end_m - one.s_m >= self.needed.room_m:
+        if self._is_open(one.at, one.s_m, at_s):
+            if room_m >= self.needed.room_m:
                 return self.needed
-            if (
-                one.vehicle.controller.broken_mps2 is not None
-                or one.vehicle.state[1] > STANDING_MPS
-                or self._is_open(one.at, one.s_m, at_s + SOON_S)
-                or not self._only_vehicles_ahead(one.vehicle, at_s)
-            ):
-                return None
-            room_m = min(room_m, one.room_m)
-            if room_m < 2.0 * self.needed.room_m:  # it has to keep its distance
-                limits = one.vehicle.controller.plant.limits
-                return re_entry_behind(self._scenario, limits, math.floor(room_m))
-        return self.needed if room_m >= self.needed.room_m else None
+        elif end.end_m - one.s_m >= self.needed.room_m:
+            return self.needed
+        elif (
+            vehicle.controller.broken_mps2 is not None
+            or vehicle.state[1] > STANDING_MPS
+            or self._is_open(one.at, one.s_m, at_s + SOON_S)
+            or not self._only_vehicles_ahead(vehicle, at_s)
+        ):
+            return None
+        room_m = min(room_m, one.room_m)
+        if room_m >= 2.0 * self.needed.room_m:  # it need not keep its distance
+            return self.needed
+        limits = vehicle.controller.plant.limits
+        return re_entry_behind(self._scenario, limits, math.floor(room_m))
 
     def into(self, lane: int, one: Waiting, at_s: float) -> ReEntry:
         """Return what a vehicle itself, which may start, needs to start into a lane."""
-        needed = None if lane == one.at[0] else self.needed_by(one, at_s)
-        if needed is None or needed is self.needed:
-            # Weak types need more columns than strong ones, which arrive earlier.
-            return own_re_entry(self._scenario, one.vehicle.controller.plant.limits)
-        return needed
+        needed = self.needed_by(one, at_s)
+        if needed is not None and self.keeps_distance(lane, one, at_s):
+            return needed
+        # Weak types need more columns than strong ones, which arrive earlier.
+        return own_re_entry(self._scenario, one.vehicle.controller.plant.limits)
+
+    def keeps_distance(self, lane: int, one: Waiting, at_s: float) -> bool:
+        """Return whether a vehicle starts slowly into a lane; see `re_entry_behind`."""
+        needed = self.needed_by(one, at_s)
+        return lane != one.at[0] and needed is not None and needed is not self.needed
 
     def passable_lanes(self, vehicle: RoadVehicle, at_s: float) -> list[int]:
         """Return the lanes of a body in which it can drive on beyond the next dead end.

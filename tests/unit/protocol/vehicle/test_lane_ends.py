@@ -231,7 +231,7 @@ def test_a_vehicle_that_stands_gets_out_before_the_end_and_into_its_cell(
     controller = controller_in((0, 0), scenario, state=standing)
     controller.leave_lattice()
     goal: Cell = (column - needed.columns + 1, 1)
-    controller.re_enter(goal, ())
+    controller.re_enter(goal, (), keeps_distance=False)
     half_m = 0.5 * vehicle.width_m
     for tick in range(start_tick, start_tick + 700):
         controller.step(tick)

@@ -26,7 +26,7 @@ from laneweave.protocol.wire.obstacle_messages import BREAKDOWN, CLOSED, Obstacl
 from laneweave.sim_bridge.bodies.motion_controller import FallbackLevel, OffLatticePhase
 from laneweave.sim_bridge.bodies.stop_lines import STANDING_MPS
 from laneweave.sim_bridge.road.entry import EntryMeter
-from laneweave.sim_bridge.road.lane_end_control import CROWDED_GAPS, OPEN_GAPS, Gap
+from laneweave.sim_bridge.road.lane_end_control import CROWDED_GAPS, LAST_S, OPEN_GAPS, Gap
 from laneweave.sim_bridge.road.obstacles import ActiveObstacle, Breakdown
 from support import road_bugs
 from support.bugs import Bug, catches
@@ -157,7 +157,7 @@ def test_nobody_waits_behind_a_vehicle_that_is_never_repaired(volume: float, see
 
 
 def check_that_nobody_waits_for_a_repair(volume: float = 1500.0, seed: int = 2) -> None:
-    """Those that could not stop at the line drive out, too: slowly, and after those at the line."""
+    """Those that could not stop at the line drive out, too, slowly."""
     road = lonely_road(evolve(BREAKS_DOWN, for_s=math.inf), volume=volume, seed=seed)
     beyond: dict[Name, float] = {}
     while len(road.vehicles) > 1 or not road.roadside.demand.exhausted(road.t_s):
@@ -176,7 +176,25 @@ def check_that_nobody_waits_for_a_repair(volume: float = 1500.0, seed: int = 2) 
     assert len(beyond) >= 2
     out = [name for _, kind, name in road.events if kind == DRIVES_OUT]
     assert sorted(out) == [name for name in names(road, LEFT_LATTICE) if name != broken]
-    assert {*out[-len(beyond) :]} == {*beyond}
+    # They do not wait until nobody is at the line.
+    last_s = AT_S + LAST_S + 40.0 * len(beyond)
+    assert all(left_s < last_s for left_s in beyond.values())
+    assert {*out[-2:]}.isdisjoint(beyond)
+
+
+@pytest.mark.parametrize("later", [(), (RoadEvent(LANE, 600.0, 650.0, 0.0),)], ids=["no", "yes"])
+def test_who_starts_behind_a_body_keeps_its_distance_although_the_lane_ends_later(
+    later: tuple[RoadEvent, ...],
+) -> None:
+    road = lonely_road(evolve(BREAKS_DOWN, for_s=math.inf), volume=1500.0, seed=2, events=later)
+    started: set[Name] = set()
+    while road.t_s < AT_S + 150.0:
+        road.step()
+        for name, vehicle in road.vehicles.items():
+            if vehicle.controller.stop_lines.keeps_distance:
+                started.add(name)
+                assert vehicle.controller.level is not FallbackLevel.EMERGENCY
+    assert len(started) == 2
 
 
 def gaps_of(road: LonelyRoad) -> dict[int, list[Gap]]:

@@ -71,7 +71,8 @@ def run_core(
     sys.setswitchinterval(SWITCH_S)
     keys = Keys(access.realm)
     inbox = Inbox()
-    with contextlib.closing(_Worker(inbox.put)) as worker:
+    stops = stop_signals(_StopSignals(inbox.put, grace_s))
+    with stops, contextlib.closing(_Worker(inbox.put)) as worker:
 
         def submit(job: Compute | Delegate | StopJob) -> None:
             if isinstance(job, Compute):
@@ -83,19 +84,18 @@ def run_core(
             else:
                 pool.stop(job.job)
 
-        with stop_signals(_StopSignals(inbox.put, grace_s)):
-            # Until the process is connected, the inbox can contain only `Stopping`.
-            transport = connect(access, inbox.put, lambda wait_s: any(inbox.take(wait_s)))
-            if transport is None:
-                return
-            node = Node(core, transport, keys, submit, Name(f"{os.getpid()}-{time.time_ns()}"))
-            observe(snapshot_source(inbox.put))
-            try:
-                node.dispatch(Started(), time.monotonic())
-                while not node.ended:
-                    _step(node, inbox)
-            finally:
-                transport.close()
+        # Until the process is connected, the inbox can contain only `Stopping`.
+        transport = connect(access, inbox.put, lambda wait_s: any(inbox.take(wait_s)))
+        if transport is None:
+            return
+        node = Node(core, transport, keys, submit, Name(f"{os.getpid()}-{time.time_ns()}"))
+        observe(snapshot_source(inbox.put))
+        try:
+            node.dispatch(Started(), time.monotonic())
+            while not node.ended:
+                _step(node, inbox)
+        finally:
+            transport.close()
 
 
 def _step(node: Node, inbox: Inbox) -> None:
