@@ -48,7 +48,7 @@ Clock = Callable[[], float]
 
 
 class StoppedError(Exception):
-    """A delegated computation must end, since its result is no longer needed."""
+    """A computation must end, since its result is no longer needed."""
 
 
 @frozen

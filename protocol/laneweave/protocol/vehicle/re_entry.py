@@ -7,13 +7,17 @@ one that passes the vehicle when it starts.
 from __future__ import annotations
 
 import math
+from collections.abc import Hashable
 from functools import lru_cache, reduce
+from typing import Protocol
 
 from attrs import frozen
 
-from laneweave.protocol.lattice import Cell
-from laneweave.protocol.scenario.fields import Scenario
-from laneweave.protocol.scenario.vehicle_tables import Vehicle
+from laneweave.protocol.lattice import Cell, Lattice
+from laneweave.protocol.scenario.deployment_fields import Runtime
+from laneweave.protocol.scenario.formation_table import FormationSettings
+from laneweave.protocol.scenario.vehicle_tables import Braking, Sensing, Tracking, Vehicle
+from laneweave.protocol.scenario.vehicle_types import VehicleTypes
 from laneweave.protocol.vehicle.emergency_brake import ERROR_SIGMAS, EmergencyBrake, spare_error_m
 from laneweave.protocol.vehicle.motion import (
     ARRIVED_ALONG_M,
@@ -37,6 +41,38 @@ _MAX_RE_ENTRY_S = 120.0
 _FAR_M = 1000.0
 
 
+class Conditions(Hashable, Protocol):
+    """What re-entry depends on; a scenario has it."""
+
+    @property
+    def lattice(self) -> Lattice:
+        """The moving lattice."""
+
+    @property
+    def types(self) -> VehicleTypes:
+        """Types of vehicles."""
+
+    @property
+    def formation(self) -> FormationSettings:
+        """Speed v_F."""
+
+    @property
+    def runtime(self) -> Runtime:
+        """Length of a tick."""
+
+    @property
+    def sensing(self) -> Sensing:
+        """Errors of sensors."""
+
+    @property
+    def braking(self) -> Braking:
+        """Assumptions of the emergency brake."""
+
+    @property
+    def tracking(self) -> Tracking:
+        """Distance to the vehicle ahead."""
+
+
 @frozen
 class ReEntry:
     """How a vehicle gets from standing at a stop line into the neighbouring lane."""
@@ -57,7 +93,7 @@ class ReEntry:
         )
 
 
-def re_entry(scenario: Scenario) -> ReEntry:
+def re_entry(scenario: Conditions) -> ReEntry:
     """Return what every type of vehicle needs to drive from standing into the neighbouring lane.
 
     The motion controller drives with its hold law towards a cell of the neighbouring lane behind
@@ -72,7 +108,7 @@ def re_entry(scenario: Scenario) -> ReEntry:
 
 
 @lru_cache(maxsize=256)
-def own_re_entry(scenario: Scenario, limits: Vehicle) -> ReEntry:
+def own_re_entry(scenario: Conditions, limits: Vehicle) -> ReEntry:
     """Return what vehicles with some limits need; see `re_entry`.
 
     Raises:
@@ -86,8 +122,8 @@ def own_re_entry(scenario: Scenario, limits: Vehicle) -> ReEntry:
 
 
 @lru_cache(maxsize=256)
-def re_entry_behind(scenario: Scenario, limits: Vehicle, room_m: int) -> ReEntry | None:
-    """Return what a vehicle needs that stands behind another one, in a lane that does not end.
+def re_entry_behind(scenario: Conditions, limits: Vehicle, room_m: int) -> ReEntry | None:
+    """Return what a vehicle needs that stands behind another one.
 
     It starts slowly, and keeps its distance to the one ahead until it has left the lane.
 
@@ -97,7 +133,7 @@ def re_entry_behind(scenario: Scenario, limits: Vehicle, room_m: int) -> ReEntry
         room_m: distance to the vehicle ahead, rounded down, since results are kept.
 
     Returns:
-        None: the room is too small.
+        None: the room is too small, as less than 27 m are with the default vehicle.
     """
     first = own_re_entry(scenario, limits).columns
     for columns in range(first, first + _MORE_COLUMNS + 1):
@@ -108,7 +144,7 @@ def re_entry_behind(scenario: Scenario, limits: Vehicle, room_m: int) -> ReEntry
 
 
 def _needed(
-    scenario: Scenario, limits: Vehicle, columns: int, room_m: float = math.inf
+    scenario: Conditions, limits: Vehicle, columns: int, room_m: float = math.inf
 ) -> ReEntry | None:
     """Return what a vehicle needs that starts into some columns; None: it needs more columns."""
     found = [_re_entry(scenario, limits, columns, late_s, room_m) for late_s in (0.0, START_S)]
@@ -122,7 +158,7 @@ def _needed(
 
 
 def _re_entry(
-    scenario: Scenario, limits: Vehicle, columns: int, late_s: float, ahead_m: float
+    scenario: Conditions, limits: Vehicle, columns: int, late_s: float, ahead_m: float
 ) -> tuple[float, float] | None:
     """Return the `room_m` and `distance_m` of one motion of `re_entry`, not rounded.
 

@@ -1,9 +1,10 @@
 """The roadside at the ends of lanes: brings vehicles that wait there back into the lattice.
 
-For each vehicle that waits at a stop line, the entry meter keeps some columns of the neighbouring
-lane free (a *gap*): no vehicle enters them, and no vehicle owns their cells, so no plan leads into
-them. When the gap passes the waiting vehicle, its motion controller drives into it, and takes its
-cells once it has arrived in one of the last columns. This needs neither agent nor leader nor
+For each vehicle that waits at a dead end, the entry meter keeps some columns of a lane beside it
+free, or of its own lane once that is open (a *gap*): no vehicle enters them, and no vehicle owns
+their cells, so no plan leads into them. When the gap passes the vehicle, its motion controller
+drives into it, and takes its cells once it has arrived in one of the last columns; `restarts` says
+where it can start. This needs neither agent nor leader nor
 message: it is how a vehicle enters at the start of the road.
 
 With formations, the columns are free in all lanes and belong to no formation. The vehicle that
@@ -31,8 +32,7 @@ from laneweave.sim_bridge.bodies.command_checks import BESIDE_M
 from laneweave.sim_bridge.bodies.motion_controller import OffLatticePhase
 from laneweave.sim_bridge.bodies.stop_lines import STANDING_MPS
 from laneweave.sim_bridge.road.entry import EntryMeter
-from laneweave.sim_bridge.road.obstacles import Obstacles
-from laneweave.sim_bridge.road.restarts import Restarts, Waiting
+from laneweave.sim_bridge.road.restarts import ClosedParts, Restarts, Waiting, WaitingBody
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
 
 OPEN_GAPS, CROWDED_GAPS = 1, 5
@@ -76,10 +76,10 @@ class LaneEndChange:
 class LaneEndControl:
     """Vehicles without cells, and the gaps that are kept free for them."""
 
-    def __init__(self, scenario: Scenario, meter: EntryMeter, obstacles: Obstacles) -> None:
+    def __init__(self, scenario: Scenario, meter: EntryMeter, closed: ClosedParts) -> None:
         """Begin without vehicles."""
         self._meter = meter
-        self._obstacles = obstacles
+        self._closed = closed
         self._cells_stay_free = territory_of(scenario).given_up_cells_stay_free
         self._scenario = scenario
         self._lattice = scenario.lattice
@@ -107,7 +107,7 @@ class LaneEndControl:
                 vanish only when no vehicle waits there (`in_use`).
         """
         self._any, self._temporary = bool(lane_ends), lane_ends.temporary
-        self._restarts = Restarts(self._scenario, self._obstacles, lane_ends)
+        self._restarts = Restarts(self._scenario, self._closed, lane_ends)
         # In a lane, those ahead get gaps first.
         farthest_first = sorted(self._restarts.ends, key=lambda at: (at[0], -at[1]))
         before, self._gaps = self._gaps, {at: [] for at in farthest_first}
@@ -170,8 +170,8 @@ class LaneEndControl:
     ) -> list[Waiting]:
         """Return the vehicles at a dead end in the order in which they get gaps.
 
-        Those between the line and a part that is closed get theirs last for a time, which are long
-        and cost others time, unless they leave no room to those behind them.
+        Those between the line and a part that is closed need long gaps, which cost others time, so
+        they come last for a time, unless they leave no room to those behind them.
         """
         last = [
             one
@@ -427,7 +427,7 @@ class LaneEndControl:
         )
         return LaneEndChange(vehicle.name, DRIVES_OUT, gap.lane)
 
-    def _is_free(self, vehicle: RoadVehicle, gap: Gap, distance_m: float) -> bool:
+    def _is_free(self, vehicle: WaitingBody, gap: Gap, distance_m: float) -> bool:
         """Return whether the sensors of a vehicle show that a gap is free."""
         neighbours = vehicle.controller.neighbours
         # The vehicle behind is a column behind the rearmost of the gap.

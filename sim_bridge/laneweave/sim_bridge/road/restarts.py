@@ -9,12 +9,12 @@ into a longer gap (`re_entry_behind`).
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from typing import Self
+from collections.abc import Iterator, Sequence
+from typing import Protocol, Self
 
 from attrs import evolve, frozen
 
-from laneweave.protocol.road_layout import LanePosition
+from laneweave.protocol.road_layout import LanePosition, TemporaryClosure
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.lane_end import LaneEnd
 from laneweave.protocol.vehicle.lane_ends import (
@@ -23,15 +23,16 @@ from laneweave.protocol.vehicle.lane_ends import (
     lanes_beside,
     sections_to_lines,
 )
+from laneweave.protocol.vehicle.motion import State
 from laneweave.protocol.vehicle.re_entry import (
     ReEntry,
     own_re_entry,
     re_entry,
     re_entry_behind,
 )
+from laneweave.protocol.wire.messages import Name
+from laneweave.sim_bridge.bodies.motion_controller import MotionController
 from laneweave.sim_bridge.bodies.stop_lines import STANDING_MPS
-from laneweave.sim_bridge.road.obstacles import Obstacles
-from laneweave.sim_bridge.road.vehicle import RoadVehicle
 
 ROOM_ERROR_M = 1.0
 """Room behind another vehicle that a vehicle need not have for a gap that was kept free for it."""
@@ -40,18 +41,54 @@ SOON_S = 30.0
 gap that it would need costs vehicles in other lanes more."""
 
 
-@frozen
+class ClosedParts(Protocol):
+    """The causes of parts that are closed for a time; see `Obstacles`."""
+
+    def still_closed(self, t_s: float) -> Sequence[TemporaryClosure]:
+        """Return the parts whose cause is not over at a road time."""
+
+    def without_vehicles(self, t_s: float) -> Sequence[TemporaryClosure]:
+        """Return those in which no vehicle may be."""
+
+
+class WaitingBody(Protocol):
+    """What matters of a vehicle that waits; see `RoadVehicle`."""
+
+    controller: MotionController
+
+    @property
+    def name(self) -> Name:
+        """Its name."""
+
+    @property
+    def state(self) -> State:
+        """(s [m], v [m/s], a [m/s2], y [m], v_y [m/s], a_y [m/s2])."""
+
+    @property
+    def size(self) -> tuple[float, float]:
+        """Length and width of the body [m]."""
+
+    @property
+    def body_lane(self) -> int:
+        """Lane in which most of the body is."""
+
+    @property
+    def lanes_used(self) -> set[int]:
+        """Lanes in which parts of the body are, or will be."""
+
+
+@frozen(eq=False)
 class Waiting:
     """A vehicle that waits at a dead end."""
 
-    vehicle: RoadVehicle
+    vehicle: WaitingBody
     at: LanePosition
     """Lane and position of the dead end."""
     room_m: float
     """Distance to the vehicle ahead of it; inf: there is none."""
 
     @classmethod
-    def of(cls, vehicle: RoadVehicle, at: LanePosition) -> Self:
+    def of(cls, vehicle: WaitingBody, at: LanePosition) -> Self:
         """Return a vehicle with the room that its sensors show."""
         lanes, ahead = vehicle.lanes_used, vehicle.controller.neighbours.ahead
         gaps_m = (one.gap_m for one in ahead if one.lane in lanes)
@@ -75,21 +112,21 @@ class Waiting:
 class Restarts:
     """The dead ends of a road, and how vehicles that wait there start."""
 
-    def __init__(self, scenario: Scenario, obstacles: Obstacles, lane_ends: LaneEnds) -> None:
+    def __init__(self, scenario: Scenario, closed: ClosedParts, lane_ends: LaneEnds) -> None:
         """Derive where they start.
 
         Args:
             scenario: the road without obstacles.
-            obstacles: causes of parts that are closed for a time.
+            closed: causes of parts that are closed for a time.
             lane_ends: ends of lanes now.
         """
-        self._scenario, self._obstacles = scenario, obstacles
+        self._scenario, self._closed = scenario, closed
         self.ends: dict[LanePosition, LaneEnd] = {(end.lane, end.end_m): end for end in lane_ends}
         """Dead ends by lane and position."""
         self.needed = re_entry(scenario) if self.ends else ReEntry(0.0, 0, 0.0)
         """What a vehicle at a stop line needs."""
-        closed = lane_ends.temporary.closed
-        self._sections = sections_to_lines(scenario, closed) if self.ends else ()
+        parts = lane_ends.temporary.closed
+        self._sections = sections_to_lines(scenario, parts) if self.ends else ()
 
     def merged(self, at: LanePosition) -> LanePosition | None:
         """Return an end, or that of the part before it, into which its own part has merged."""
@@ -196,7 +233,7 @@ class Restarts:
         needed = self.needed_by(one, at_s)
         return lane != one.at[0] and needed is not None and needed is not self.needed
 
-    def passable_lanes(self, vehicle: RoadVehicle, at_s: float) -> list[int]:
+    def passable_lanes(self, vehicle: WaitingBody, at_s: float) -> list[int]:
         """Return the lanes of a body in which it can drive on beyond the next dead end.
 
         They are open, or only other vehicles, which it senses, keep it from driving.
@@ -227,17 +264,17 @@ class Restarts:
             end.sudden
             and not any(
                 part.lane == end.lane and s_m < part.to_m and part.from_m < end.reopens_m
-                for part in self._obstacles.still_closed(at_s)
+                for part in self._closed.still_closed(at_s)
             )
         )
 
-    def _only_vehicles_ahead(self, vehicle: RoadVehicle, at_s: float) -> bool:
+    def _only_vehicles_ahead(self, vehicle: WaitingBody, at_s: float) -> bool:
         """Return whether nothing but vehicles can be ahead of a body in its dead ends."""
         lanes, s_m = vehicle.lanes_used, vehicle.state[0]
         ends = [self.ends[at] for lane in lanes if (at := self.end_ahead(lane, s_m))]
         return all(end.sudden for end in ends) and not any(
             part.lane == end.lane and s_m < part.to_m and part.from_m < end.reopens_m
-            for part in self._obstacles.without_vehicles(at_s)
+            for part in self._closed.without_vehicles(at_s)
             for end in ends
         )
 

@@ -164,7 +164,7 @@ class _Worker:
         self._jobs.put(job)
 
     def close(self) -> None:
-        """Stop the computation, discard those that wait, and end the thread."""
+        """Stop the computation when it reads its clock, discard those that wait, end the thread."""
         self._closed = True
         self._jobs.put(None)
         if self._thread is not None:
