@@ -54,7 +54,7 @@ class Conditions(Hashable, Protocol):
 
     @property
     def formation(self) -> FormationSettings:
-        """Speed v_F."""
+        """Settings of formations, with the speed v_F."""
 
     @property
     def runtime(self) -> Runtime:
@@ -146,7 +146,7 @@ def re_entry_behind(scenario: Conditions, limits: Vehicle, room_m: int) -> ReEnt
 def _needed(
     scenario: Conditions, limits: Vehicle, columns: int, room_m: float = math.inf
 ) -> ReEntry | None:
-    """Return what a vehicle needs that starts into some columns; None: it needs more columns."""
+    """Return what a vehicle needs for re-entry into a gap; None: the gap has too few columns."""
     found = [_re_entry(scenario, limits, columns, late_s, room_m) for late_s in (0.0, START_S)]
     possible = [each for each in found if each is not None]
     if len(possible) < len(found):

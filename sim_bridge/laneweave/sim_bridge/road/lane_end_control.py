@@ -180,7 +180,7 @@ class LaneEndControl:
             and t_s < self._since_s[one.vehicle.name] + LAST_S
         ]
         first = [one for one in waiting if one not in last]
-        at_line = [one for one in first if one.s_m < min(each.s_m for each in last)] if last else []
+        at_line = [one for one in first if last and one.s_m < last[-1].s_m]  # foremost first
         if not at_line or any(one in last for one in self._blocking(at_line[0], vehicles, t_s)):
             return waiting
         return first + last
@@ -405,7 +405,7 @@ class LaneEndControl:
             or self._blocking(one, vehicles, t_s)
         ):
             return False
-        distance_m = self._restarts.into(gap.lane, one, t_s).distance_m
+        distance_m = self._restarts.into(gap.lane, one, t_s)[0].distance_m
         settles_s = 2.0 * distance_m / self._lattice.speed_mps
         return self._is_free(one.vehicle, gap, distance_m) and not any(
             part.lane == gap.lane
@@ -419,12 +419,10 @@ class LaneEndControl:
         """Let a waiting vehicle re-enter into a gap."""
         vehicle = one.vehicle
         gap.vehicle = vehicle.name
-        needed = self._restarts.into(gap.lane, one, t_s)
-        vehicle.controller.re_enter(
-            (gap.columns[-needed.columns], gap.lane),
-            self._restarts.passable_lanes(vehicle, t_s),
-            keeps_distance=self._restarts.keeps_distance(gap.lane, one, t_s),
-        )
+        needed, slowly = self._restarts.into(gap.lane, one, t_s)
+        cell = gap.columns[-needed.columns], gap.lane
+        passable = self._restarts.passable_lanes(vehicle, t_s)
+        vehicle.controller.re_enter(cell, passable, keeps_distance=slowly)
         return LaneEndChange(vehicle.name, DRIVES_OUT, gap.lane)
 
     def _is_free(self, vehicle: WaitingBody, gap: Gap, distance_m: float) -> bool:

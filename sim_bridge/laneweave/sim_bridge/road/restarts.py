@@ -23,19 +23,18 @@ from laneweave.protocol.vehicle.lane_ends import (
     lanes_beside,
     sections_to_lines,
 )
-from laneweave.protocol.vehicle.motion import State
 from laneweave.protocol.vehicle.re_entry import (
     ReEntry,
     own_re_entry,
     re_entry,
     re_entry_behind,
 )
-from laneweave.protocol.wire.messages import Name
 from laneweave.sim_bridge.bodies.motion_controller import MotionController
 from laneweave.sim_bridge.bodies.stop_lines import STANDING_MPS
+from laneweave.sim_bridge.road.vehicles_in_part import BodyOnRoad
 
 ROOM_ERROR_M = 1.0
-"""Room behind another vehicle that a vehicle need not have for a gap that was kept free for it."""
+"""Margin for measurement errors: gaps are requested for this much less room than is measured."""
 SOON_S = 30.0
 """Time in which a part will be open so soon that a vehicle behind others waits for it: the longer
 gap that it would need costs vehicles in other lanes more."""
@@ -51,30 +50,14 @@ class ClosedParts(Protocol):
         """Return those in which no vehicle may be."""
 
 
-class WaitingBody(Protocol):
+class WaitingBody(BodyOnRoad, Protocol):
     """What matters of a vehicle that waits; see `RoadVehicle`."""
 
     controller: MotionController
 
     @property
-    def name(self) -> Name:
-        """Its name."""
-
-    @property
-    def state(self) -> State:
-        """(s [m], v [m/s], a [m/s2], y [m], v_y [m/s], a_y [m/s2])."""
-
-    @property
-    def size(self) -> tuple[float, float]:
-        """Length and width of the body [m]."""
-
-    @property
     def body_lane(self) -> int:
         """Lane in which most of the body is."""
-
-    @property
-    def lanes_used(self) -> set[int]:
-        """Lanes in which parts of the body are, or will be."""
 
 
 @frozen(eq=False)
@@ -89,7 +72,7 @@ class Waiting:
 
     @classmethod
     def of(cls, vehicle: WaitingBody, at: LanePosition) -> Self:
-        """Return a vehicle with the room that its sensors show."""
+        """Return a vehicle with the distance that its sensors measure."""
         lanes, ahead = vehicle.lanes_used, vehicle.controller.neighbours.ahead
         gaps_m = (one.gap_m for one in ahead if one.lane in lanes)
         return cls(vehicle, at, min(gaps_m, default=math.inf))
@@ -129,7 +112,7 @@ class Restarts:
         self._sections = sections_to_lines(scenario, parts) if self.ends else ()
 
     def merged(self, at: LanePosition) -> LanePosition | None:
-        """Return an end, or that of the part before it, into which its own part has merged."""
+        """Return a dead end; if its part has merged into an earlier one, the end before that."""
         if at in self.ends:
             return at
         lane, end_m = at
@@ -194,9 +177,9 @@ class Restarts:
         return lanes_beside(self._scenario, end.lane, starts_m, self._sections, needed)
 
     def needed_by(self, one: Waiting, at_s: float) -> ReEntry | None:
-        """Return what a vehicle needs to start beside its lane, at a road time, where it waits.
+        """Return what a vehicle needs for re-entry into a lane beside it, from where it waits.
 
-        None: it has no room.
+        None: at this road time, it has not enough room.
         """
         if self._is_before_line(one):
             return self.needed
@@ -220,39 +203,31 @@ class Restarts:
         limits = vehicle.controller.plant.limits
         return re_entry_behind(self._scenario, limits, math.floor(room_m))
 
-    def into(self, lane: int, one: Waiting, at_s: float) -> ReEntry:
-        """Return what a vehicle itself, which may start, needs to start into a lane."""
-        needed = self.needed_by(one, at_s)
-        if needed is not None and self.keeps_distance(lane, one, at_s):
-            return needed
-        # Weak types need more columns than strong ones, which arrive earlier.
-        return own_re_entry(self._scenario, one.vehicle.controller.plant.limits)
+    def into(self, lane: int, one: Waiting, at_s: float) -> tuple[ReEntry, bool]:
+        """Return what a vehicle needs that starts into a lane, and whether it starts slowly.
 
-    def keeps_distance(self, lane: int, one: Waiting, at_s: float) -> bool:
-        """Return whether a vehicle starts slowly into a lane; see `re_entry_behind`."""
-        needed = self.needed_by(one, at_s)
-        return lane != one.at[0] and needed is not None and needed is not self.needed
+        See `re_entry_behind`.
+        """
+        needed = None if lane == one.at[0] else self.needed_by(one, at_s)
+        if needed is None or needed is self.needed:
+            # Weak types need more columns than strong ones, which arrive earlier.
+            return own_re_entry(self._scenario, one.vehicle.controller.plant.limits), False
+        return needed, True
 
     def passable_lanes(self, vehicle: WaitingBody, at_s: float) -> list[int]:
         """Return the lanes of a body in which it can drive on beyond the next dead end.
 
         They are open, or only other vehicles, which it senses, keep it from driving.
         """
-        ahead = {lane: self.end_ahead(lane, vehicle.state[0]) for lane in vehicle.lanes_used}
-        only_vehicles = self._only_vehicles_ahead(vehicle, at_s)
-        return [
-            lane
-            for lane, at in ahead.items()
-            if at
-            and (
-                self._is_open(at, vehicle.state[0], at_s)
-                or (
-                    only_vehicles
-                    and self.ends[at].sudden
-                    and self.ends[at].end_m - vehicle.state[0] < self.needed.room_m
-                )
-            )
-        ]
+        s_m, only_vehicles = vehicle.state[0], self._only_vehicles_ahead(vehicle, at_s)
+
+        def is_passable(at: LanePosition) -> bool:
+            end = self.ends[at]
+            starts_slowly = end.sudden and end.end_m - s_m < self.needed.room_m
+            return self._is_open(at, s_m, at_s) or (only_vehicles and starts_slowly)
+
+        ahead = {lane: self.end_ahead(lane, s_m) for lane in vehicle.lanes_used}
+        return [lane for lane, at in ahead.items() if at and is_passable(at)]
 
     def _is_open(self, at: LanePosition, s_m: float, at_s: float) -> bool:
         """Return whether a vehicle can drive on in its lane at a road time, beyond a dead end.
@@ -262,20 +237,16 @@ class Restarts:
         end = self.ends[at]
         return s_m >= end.reopens_m or (
             end.sudden
-            and not any(
-                part.lane == end.lane and s_m < part.to_m and part.from_m < end.reopens_m
-                for part in self._closed.still_closed(at_s)
-            )
+            and not any(_is_ahead(part, end, s_m) for part in self._closed.still_closed(at_s))
         )
 
     def _only_vehicles_ahead(self, vehicle: WaitingBody, at_s: float) -> bool:
         """Return whether nothing but vehicles can be ahead of a body in its dead ends."""
         lanes, s_m = vehicle.lanes_used, vehicle.state[0]
         ends = [self.ends[at] for lane in lanes if (at := self.end_ahead(lane, s_m))]
-        return all(end.sudden for end in ends) and not any(
-            part.lane == end.lane and s_m < part.to_m and part.from_m < end.reopens_m
-            for part in self._closed.without_vehicles(at_s)
-            for end in ends
+        closed = self._closed.without_vehicles(at_s)
+        return all(
+            end.sudden and not any(_is_ahead(part, end, s_m) for part in closed) for end in ends
         )
 
     def _later(self, one: Waiting) -> Iterator[LaneEnd]:
@@ -288,3 +259,8 @@ class Restarts:
     def _is_before_line(self, one: Waiting) -> bool:
         """Return whether a vehicle waits at the stop line before a dead end, or before it."""
         return one.s_m <= self.ends[one.at].line_m + NEAR_LINE_M
+
+
+def _is_ahead(part: TemporaryClosure, end: LaneEnd, s_m: float) -> bool:
+    """Return whether a part at a dead end is ahead of a body, or around it."""
+    return part.lane == end.lane and s_m < part.to_m and part.from_m < end.reopens_m

@@ -217,7 +217,7 @@ def gaps_of(road: LonelyRoad) -> dict[int, list[Gap]]:
 def test_gaps_leave_cells_for_the_vehicles_that_pass(
     volume: float, least: int, most: int, *, in_lane: bool
 ) -> None:
-    """Where there is room, they take turns in the lanes on both sides."""
+    """Where there is room, gaps alternate between the lanes on both sides."""
     road = lonely_road(evolve(BREAKS_DOWN, for_s=math.inf), volume=volume)
     seen: dict[int, set[range]] = {}
     while all(len(gaps) < 2 for gaps in seen.values()):
