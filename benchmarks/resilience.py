@@ -25,7 +25,12 @@ import pyarrow.parquet as pq
 from attrs import frozen
 
 from experiments import run_missing
-from laneweave.protocol.wire.events import CARETAKER_TOOK_OVER, PLAN_MADE
+from laneweave.protocol.wire.events import (
+    CARETAKER_TOOK_OVER,
+    PART_CLOSED,
+    PLAN_EVENTS,
+    PLAN_MADE,
+)
 
 HERE = Path(__file__).resolve().parent
 TIMEOUT_S = 3600.0
@@ -56,6 +61,12 @@ def rolling(name: str, faults: str | None, duration_s: int = 200) -> Experiment:
     return Experiment(f"rolling-{name}", faults, options)
 
 
+def breakdown(operation: str, volume: int) -> Experiment:
+    """Return an experiment in which a vehicle breaks down and the leader is killed then."""
+    options = demand(volume, 330, operation)
+    return Experiment(f"breakdown-{operation}-{volume}", "breakdown-leader-killed.toml", options)
+
+
 EXPERIMENTS = (
     Experiment("undisturbed", None, demand(1600, 200)),
     Experiment("loss-10", "lossy10", demand(1600, 200)),
@@ -69,6 +80,8 @@ EXPERIMENTS = (
     Experiment("router-killed", "router-killed-10-times.toml", (*demand(1000, 300), *REAL_TIME)),
     Experiment("leader-killed", "leader-killed-50-times.toml", (*demand(1000, 300), *REAL_TIME)),
     Experiment("leader-stopped", "leader-stopped-30-times.toml", (*demand(600, 560), *REAL_TIME)),
+    *(breakdown("rolling", volume) for volume in (1000, 1450, 1800)),
+    *(breakdown("formations", volume) for volume in (1000, 1450)),
     rolling("undisturbed", None),
     rolling("loss-10", "lossy10"),
     rolling("loss-30", "loss-30.toml"),
@@ -99,11 +112,17 @@ def figures(folder: Path) -> dict[str, Any]:
     kinds: Counter[str] = Counter()
     plans: Counter[int] = Counter()
     killed: set[str] = set()
+    closed_s: float | None = None
+    planned_s: float | None = None
     for line in (folder / "events.jsonl").read_text(encoding="utf-8").splitlines():
         event = json.loads(line)
         kinds[event["kind"]] += 1
         if event["kind"] == PLAN_MADE:
             plans[event["formation"]] += 1
+        if event["kind"] == PART_CLOSED and closed_s is None:
+            closed_s = event["t_s"]
+        if event["kind"] in PLAN_EVENTS and closed_s is not None and planned_s is None:
+            planned_s = event["t_s"]
         if event["kind"] == CARETAKER_TOOK_OVER:
             killed.add(event["vehicle"])
     others = [
@@ -127,6 +146,10 @@ def figures(folder: Path) -> dict[str, Any]:
         "replanned": sum(plans.values()) - len(plans),
         "leader_recovery_s": _spread(failover["recovery_s"]),
         "plan_recovery_s": _spread(failover.get("plan_recovery_s", [])),
+        "stopped": sum(one["stopped"] for one in summary["obstacles"] or ()),
+        "planned_after_s": None
+        if closed_s is None or planned_s is None
+        else round(planned_s - closed_s, 2),
         "events": dict(kinds),
     }
 
