@@ -17,7 +17,7 @@ clock that is passed in.
 | relative path map | `path_map` |
 | parallel and interlaced structure | `formation_structures` |
 
-Additions: improvements to TAPPA (`paper.cbs.Improvements`, `paper.joint_search`), a record of its
-run (`paper.explanation`), branch and bound (`exact`), the planner for rolling operation
-(`rolling`), and conflicts computed from sizes and motions (`geometry`).
+Additions: improvements to TAPPA (`paper.cbs.Improvements`), a record of its run
+(`paper.explanation`), branch and bound and a joint search (`exact`), the planner for rolling
+operation (`rolling`), and conflicts computed from sizes and motions (`geometry`).
 """

@@ -2,9 +2,10 @@
 
 Branch and bound and the rolling planner call functions that numba compiles, half a minute for each
 of the two planners, and stores in its cache on disk; from there they load in less than a second.
-TAPPA needs none. So a real-time process never compiles: it answers with TAPPA until another
-process, of low priority, has filled the cache (`BackgroundCompilation`). A process whose results
-must not depend on the cache compiles before it uses a kernel (`Kernels.load`).
+TAPPA needs them only for its joint search, and can do without. So a real-time process never
+compiles: it answers with TAPPA until another process, of low priority, has filled the cache
+(`BackgroundCompilation`). A process whose results must not depend on the cache compiles before it
+uses a kernel (`Kernels.load`).
 
 A lock file lets one process at a time compile; the kernel of the operating system releases it when
 its owner ends in any way. A killed compilation loses only the function that it was compiling.
@@ -115,6 +116,19 @@ class Kernels:
                 log.warning("compiling once, this takes half a minute", solver=self.name)
                 self.compile()
 
+    def available(self, *, compiled_only: bool) -> bool:
+        """Load the kernels; return whether they are loaded.
+
+        Args:
+            compiled_only: whether not to compile those that are not compiled.
+
+        Raises:
+            CacheError: there is no folder for the compiled code.
+        """
+        if not compiled_only:
+            self.load()
+        return self.load_if_compiled()
+
     def compile(self) -> None:
         """Compile the kernels that are not compiled, and load all; needs `compilation_lock`.
 
@@ -176,6 +190,7 @@ BRANCHING: Final = Kernels(
         "exact.branching_kernel",
         "exact.multipliers_kernel",
         "exact.negotiation_kernel",
+        "exact.joint_kernel",
         "random_kernel",
     ),
 )

@@ -26,8 +26,9 @@ from laneweave.protocol.scenario.formation_table import DEFAULT_SOLVER
 TAPPA_SHARE: Final = 0.75
 """Share of the deadline, and of the node limit, after which branching replaces TAPPA.
 
-With six to eight vehicles, TAPPA needs 3 to 5 s of CPU for 15,000 nodes, its share of a scenario's
-default limit; branching needs 0.1 s for such formations (95th percentile), at most 0.6 s.
+With more vehicles than the joint search can plan, TAPPA needs 3 to 5 s of CPU for 15,000 nodes, its
+share of a scenario's default limit; branching needs 0.1 s for formations of six to eight (95th
+percentile), at most 0.6 s.
 """
 PLUG_IN_SHARE: Final = 0.5
 """Share of the deadline for a planner of a user; if it fails, built-in solvers need the rest."""
@@ -70,8 +71,9 @@ def plan(
         fallback: branching continues when TAPPA has spent `TAPPA_SHARE`, and the cheaper path set
             is returned; False: TAPPA may spend the whole budget. A solver that cannot handle the
             request at all, or a plug-in without a valid plan, is always replaced by others.
-        compiled_only: without the compiled kernels of branching, TAPPA answers instead; False: they
-            are compiled when they are needed, so that the plan does not depend on them.
+        compiled_only: without the compiled kernels of branching, TAPPA answers instead, without its
+            joint search; False: they are compiled when they are needed, so that the plan does not
+            depend on them.
         clock: returns the time for the deadline [s].
 
     Raises:
@@ -103,12 +105,15 @@ def plan(
             deadline=started + share * request.deadline_s,
             max_nodes=math.ceil(share * left),
             max_memory_mb=max_memory_mb,
+            compiled_only=compiled_only,
             clock=clock,
         )
         limits = PlanLimits(
             max(PLUG_IN_SHARE * (started + request.deadline_s - clock()), 0.0), math.ceil(left)
         )
         results.append(_solve(name, problem, request, weights, budget, limits))
+        started += budget.paused_s
+        began_s += budget.paused_wall_s
         if results[-1].found.finished or not (results[-1].found.aborted or is_limited):
             break
     rest = Budget(deadline=started + request.deadline_s, clock=clock)
@@ -134,12 +139,9 @@ def _order(requested: str, problem: Problem, *, fallback: bool) -> tuple[str, ..
 
 def _load(solver: str, *, compiled_only: bool) -> bool:
     """Load a solver; return whether it is available."""
-    if solver != BRANCHING.name:
-        prepare(solver)
-    elif compiled_only:
-        return BRANCHING.load_if_compiled()
-    else:
-        BRANCHING.load()
+    if solver == BRANCHING.name:
+        return BRANCHING.available(compiled_only=compiled_only)
+    prepare(solver)
     return True
 
 

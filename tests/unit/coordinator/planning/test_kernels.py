@@ -19,7 +19,14 @@ import attrs
 import pytest
 
 from laneweave.coordinator.planning import solve
-from laneweave.coordinator.planning.kernels import KERNELS, _without_compiling
+from laneweave.coordinator.planning.exact.joint_kernel import (
+    add_goals,
+    fill_slots,
+    search,
+    steps_from,
+)
+from laneweave.coordinator.planning.kernels import BRANCHING, KERNELS, _without_compiling
+from laneweave.coordinator.planning.paper import tappa
 from laneweave.coordinator.planning.solve import plan
 from laneweave.launch.bench.request_families import block_request, formation_request
 from support.commands import run
@@ -52,7 +59,7 @@ def counted(one): calls.append(one.name); original(one)
 kernels.Kernels.compile = counted
 """
 EASY = block_request(1, vehicles=3, deadline_s=3600.0)
-HARD = block_request(25, conflicts=("node", "edge", "special-1", "closing"), deadline_s=3600.0)
+HARD = formation_request(1, vehicles=14, deadline_s=3600.0)
 """TAPPA needs thousands of nodes for it."""
 
 
@@ -225,6 +232,7 @@ except kernels.CacheError as error:
         "NUMBA_CACHE_LOCATOR_CLASSES": "UserProvidedCacheLocator",
     }
     done = run(sys.executable, "-c", PROGRAM + program, str(workshop.folder), asked, env=nowhere)
+    assert done.returncode == 0, done.stderr
     *answers, error = printed(done.stdout)
     assert answers == ["tappa", True, "tappa"]
     assert "NUMBA_CACHE_DIR" in error
@@ -240,8 +248,15 @@ def test_all_kernels_that_plans_use_are_loaded() -> None:
     with _without_compiling():
         for vehicles, solver in ((6, "branching"), (18, "branching"), (6, "tappa")):
             assert plan(formation_request(1, vehicles=vehicles, deadline_s=2.0), solver=solver)
-        assert plan(HARD, max_nodes=100).fallback
+        assert plan(HARD, max_nodes=60).fallback
     assert all(kernels.loaded and not kernels.known_missing for kernels in KERNELS.values())
+
+
+def test_loading_calls_the_kernels_of_the_joint_search() -> None:
+    """Otherwise the first plan that needs one of them would compile it."""
+    BRANCHING.load()
+    called = (steps_from, add_goals, fill_slots, search)
+    assert all(kernel.signatures for kernel in called)
 
 
 class _Missing:
@@ -253,7 +268,8 @@ class _Missing:
         self.known_missing = known
         self.asked = 0
 
-    def load_if_compiled(self) -> bool:
+    def available(self, *, compiled_only: bool) -> bool:
+        assert compiled_only
         self.asked += 1
         return False
 
@@ -264,15 +280,17 @@ def test_tappa_answers_while_branching_is_not_compiled(
 ) -> None:
     missing = _Missing(known=known)
     monkeypatch.setattr(solve, "BRANCHING", missing)
+    monkeypatch.setattr(tappa, "BRANCHING", missing)
 
     easy = plan(EASY, compiled_only=True)
     asked = plan(EASY, solver="branching", compiled_only=True)
-    hard = plan(HARD, max_nodes=400, compiled_only=True)
+    hard = plan(HARD, max_nodes=60, compiled_only=True)
 
     assert (easy.status, easy.solver, easy.fallback) == ("optimal", "tappa", False)
     assert (asked.status, asked.solver, asked.fallback) == ("optimal", "tappa", True)
     assert asked.cost == easy.cost
     assert (hard.status, hard.solver, hard.fallback) == ("timeout", "tappa", False)
     # A process that knows that branching is missing leaves TAPPA all nodes.
-    assert (hard.nodes_expanded > solve.TAPPA_SHARE * 400 + 1) == known
-    assert missing.asked == (0 if known else 2)
+    assert (hard.nodes_expanded > solve.TAPPA_SHARE * 60 + 1) == known
+    # TAPPA asks once for its joint search.
+    assert missing.asked == (1 if known else 3)

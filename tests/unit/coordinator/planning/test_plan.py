@@ -139,7 +139,7 @@ class TestDeadline:
     @pytest.mark.parametrize(
         ("solver", "looks"),
         [
-            *(("tappa", looks) for looks in (2, 5, 20, 100, 400)),
+            *(("tappa", looks) for looks in (2, 5, 20, 50, 100)),
             *(("branching", looks) for looks in (2, 5, 8, 12)),
         ],
     )

@@ -72,25 +72,30 @@ class Teams(NamedTuple):
 def move_arrays(grid: Grid, mode: Mode, model: ConflictModel) -> MoveArrays:
     """Return the moves and conflict cliques of a grid."""
     steps = np.array(displacements(mode), dtype=np.int64)
-    free = np.zeros((grid.columns + 2, grid.lanes + 2), dtype=np.bool_)
-    free[1:-1, 1:-1] = True
-    for column, lane in grid.blocked:
-        free[column + 1, lane + 1] = False
-    inside = free[1:-1, 1:-1]
-    valid = np.array(
-        [
-            (
-                inside & free[1 + c : grid.columns + 1 + c, 1 + across : grid.lanes + 1 + across]
-            ).ravel()
-            for c, across in steps.tolist()
-        ]
-    )
+    valid = valid_moves(grid, mode)
     clique, clique_count = _cliques(grid, clique_patterns(mode, model), len(steps), valid)
     cell = np.arange(grid.columns * grid.lanes)
     columns, lanes = (reach + 1 for reach in model.reach)
     residue = cell // grid.lanes % columns * lanes + cell % grid.lanes % lanes
     step = steps[:, 0] * grid.lanes + steps[:, 1]
     return MoveArrays(grid.lanes, step, valid, clique, clique_count, residue, columns * lanes)
+
+
+def valid_moves(grid: Grid, mode: Mode) -> Bools:
+    """Return (D, X) whether a move stays on free cells."""
+    free = np.zeros((grid.columns + 2, grid.lanes + 2), dtype=np.bool_)
+    free[1:-1, 1:-1] = True
+    for column, lane in grid.blocked:
+        free[column + 1, lane + 1] = False
+    inside = free[1:-1, 1:-1]
+    return np.array(
+        [
+            (
+                inside & free[1 + c : grid.columns + 1 + c, 1 + across : grid.lanes + 1 + across]
+            ).ravel()
+            for c, across in displacements(mode)
+        ]
+    )
 
 
 def _cliques(

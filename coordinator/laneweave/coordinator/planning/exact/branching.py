@@ -17,8 +17,9 @@ The gap between the cost and the lower bound is small, so few moves remain, and 
 fathomed quickly. Unlike in conflict trees, interchangeable vehicles do not multiply the nodes.
 
 Every few nodes, negotiation (`negotiation`) looks for path sets, so that a plan exists if the
-deadline passes first; if it fails, a joint search (`reachability`) looks for a path set or proves
-that there is none.
+deadline passes first; if it fails, a search of the reachable joint states (`reachability`) looks
+for a path set or proves that there is none. With few vehicles, A* over the cells of all of them
+(`joint_search`) takes turns with the nodes: it is faster where few cells are empty.
 """
 
 from __future__ import annotations
@@ -34,6 +35,7 @@ from scipy.optimize import linear_sum_assignment
 from laneweave.coordinator.planning.budget import Budget, BudgetSpentError
 from laneweave.coordinator.planning.exact.arrays import Floats, Ints, move_arrays, teams
 from laneweave.coordinator.planning.exact.branching_kernel import FULL, STUCK, search
+from laneweave.coordinator.planning.exact.joint_search import JointSearch
 from laneweave.coordinator.planning.exact.lagrangian_bound import Relaxation, Stack, upper_bound_of
 from laneweave.coordinator.planning.exact.multipliers_kernel import (
     BEST,
@@ -68,9 +70,11 @@ _FIRST_WORK, _WORK_FOR_GAP, _STALE = 200, 100, 100
 """Maximum number of negotiation passes per call until a path set is found; afterwards, their number
 at a gap of 100 %, and the passes without improvement after which that number is halved."""
 _EXPLORE_NODES, _EXPLORE_MOVES, _MAX_EXPLORE_MOVES, _GROWTH = 16, 5_000, 1_500_000, 4
-"""Nodes after which the joint search is tried if no path set is known, and the initial and maximum
-limit on its joint moves; nodes and limit grow by the factor `_GROWTH`."""
+"""Nodes after which reachable states are explored if no path set is known, and the initial and
+maximum limit on joint moves; nodes and limit grow by the factor `_GROWTH`."""
 _TIE_NODES = 10
+_JOINT_MOVES = 200_000
+"""Moves that the joint search tries every `_NODES_BETWEEN` nodes."""
 _CALL_WORK = 8
 _BYTES_PER_S = 1_000_000_000
 """Approximate speed at which arrays are filled."""
@@ -84,6 +88,9 @@ def call_kernels() -> None:
     branching = Branching(request.problem(), request.choices(), Budget())
     branching.run()
     branching.negotiate(branching.relaxation(_SPARE_STEPS), _CALL_WORK)
+    joint = JointSearch(request.problem(), request.choices(), Budget())
+    joint.grow()
+    joint.work(_CALL_WORK)
 
 
 class Branching(Search):
@@ -93,6 +100,7 @@ class Branching(Search):
         """Prepare the search."""
         super().__init__()
         self._negotiation: Negotiation | None = None
+        self._joint: JointSearch | None = None
         self._problem = problem
         self._choices = choices
         self._budget = budget
@@ -120,6 +128,8 @@ class Branching(Search):
         try:
             self._search()
         except BudgetSpentError:
+            if self._joint is not None:
+                self.lower_bound = max(self.lower_bound, self._joint.lower_bound)
             if self.best is not None:
                 self.lower_bound = min(self.lower_bound, self.best.cost)
 
@@ -132,8 +142,7 @@ class Branching(Search):
             self.aborted = True
             return
         root = self.relaxation(steps)
-        few = len(self._choices) <= _FEW_VEHICLES
-        for number in range(0, _FEW_ITERATIONS if few else _ITERATIONS, _BATCH):
+        for number in range(0, _FEW_ITERATIONS if self._few else _ITERATIONS, _BATCH):
             self._improve(root, _BATCH)
             if math.isinf(self.lower_bound) or self._is_proven():
                 break
@@ -148,6 +157,10 @@ class Branching(Search):
                 self.finished = True
             else:
                 nodes = self._decide(root, nodes, int(self.lower_bound))
+
+    @property
+    def _few(self) -> bool:
+        return len(self._choices) <= _FEW_VEHICLES
 
     def _is_proven(self) -> bool:
         return self.best is not None and self.best.cost <= self.lower_bound
@@ -215,7 +228,7 @@ class Branching(Search):
             first = False
             if outcome == OPEN:
                 self._run_heuristics(root, nodes.multipliers[depth - 1])
-                if self.finished or (self.best is not None and self.best.cost <= cost):
+                if self.finished or self.lower_bound > cost or self._is_proven():
                     return nodes
         if outcome == REFUTED:
             self.lower_bound = cost + 1
@@ -298,6 +311,10 @@ class Branching(Search):
         if self._nodes < self._next_check:
             return
         self._next_check = self._nodes + _NODES_BETWEEN
+        if self._few:
+            self._search_jointly()
+            if self.finished or self._is_proven():
+                return
         if self._negotiation is None or self._negotiation.cost is None:
             self.negotiate(root, _FIRST_WORK, stop_at_first=True)
         else:
@@ -323,6 +340,21 @@ class Branching(Search):
                 self._keep_if_better(self._solution(self._negotiation.path))
                 if stop_at_first:
                     return
+
+    def _search_jointly(self) -> None:
+        """Continue the joint search, and keep what it has found."""
+        if self._joint is None:
+            self._joint = JointSearch(self._problem, self._choices, self._budget)
+        if self._joint.ended:
+            return
+        self._joint.work(_JOINT_MOVES, math.inf if self.best is None else self.best.cost)
+        self.lower_bound = max(self.lower_bound, self._joint.lower_bound)
+        if math.isinf(self.lower_bound):
+            self.finished = True
+        elif self._joint.solution is not None:
+            self._keep_if_better(
+                without_needless_moves(self._problem, self._joint.solution, self._budget)
+            )
 
     def _explore(self) -> None:
         reached = explore(self._problem, self._choices, self._budget, self._explore_moves)

@@ -54,8 +54,8 @@ class Improvements:
         most, instead of for all conflicts (`constraints`).
     bicliques: the constraints of a node's two children are sets of moves, and no path set
         satisfies both (`constraints`). Has an effect only with `cardinal`.
-    joint: when a tree grows large, A* over the cells of all vehicles runs in parallel
-        (`joint_search`).
+    joint: when a tree grows large, A* over the cells of all vehicles takes turns with it
+        (`exact.joint_search`), unless its code is not compiled and must not be.
     """
 
     cutoff: bool = True

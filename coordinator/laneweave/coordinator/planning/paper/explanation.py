@@ -109,7 +109,7 @@ def explain(request: PlanRequest) -> Explanation:
     problem = request.problem()
 
     def recorded(improvements: Improvements, max_nodes: int) -> Tappa:
-        budget = Budget(deadline=deadline, max_nodes=max_nodes)
+        budget = Budget(deadline=deadline, max_nodes=max_nodes, compiled_only=True)
         tappa = Tappa(request, problem, weights, budget, improvements, record=True)
         tappa.run()
         return tappa

@@ -6,16 +6,18 @@ best path set P* so far, P* is optimal.
 
 Two improvements (`cbs.Improvements`) end CBSA and the sequence of assignments earlier: CBSA looks
 only for path sets that cost less than C'*; and a search over the cells of all vehicles together
-(`joint_search`), which runs beside large constraint trees, gives a lower bound on every C'_k.
+(`exact.joint_search`), which runs beside large constraint trees, gives a lower bound on every C'_k.
 """
 
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import attrs
 
 from laneweave.coordinator.planning.budget import Budget, BudgetSpentError
+from laneweave.coordinator.planning.kernels import BRANCHING
 from laneweave.coordinator.planning.paper.assignments import (
     Assignment,
     Weights,
@@ -23,16 +25,17 @@ from laneweave.coordinator.planning.paper.assignments import (
     matrices,
 )
 from laneweave.coordinator.planning.paper.cbs import ConstraintTree, Improvements
-from laneweave.coordinator.planning.paper.joint_search import JointSearch
 from laneweave.coordinator.planning.problem import Problem, Search, Solution
 from laneweave.coordinator.planning.request import PlanRequest
 
+if TYPE_CHECKING:
+    from laneweave.coordinator.planning.exact.joint_search import JointSearch
+
 _JOINT_AFTER = 32
 """Number of nodes after which the joint search begins."""
-_MAX_JOINT_MOVES_PER_NODE = 150
-"""Upper bound on the joint moves made at a node; node n makes min(n, bound) of them. The joint
-search then takes up to about two thirds of the time. In crowded blocks it finishes first; in
-other blocks the trees do."""
+_JOINT_MOVES_PER_NODE = 50_000
+"""Moves that the joint search tries at each node from then on, until it ends; this takes as long as
+five nodes. In crowded blocks it finishes first; in other blocks the trees do."""
 
 
 @attrs.frozen
@@ -86,9 +89,9 @@ class Tappa(Search):
         self._assignments = assignments(costs, allowed, budget)
         self._budget = budget
         self._improvements = improvements or Improvements()
-        self._joint = (
-            JointSearch(problem, request.choices(), budget) if self._improvements.joint else None
-        )
+        self._choices = request.choices()
+        self._joint: JointSearch | None = None
+        self._wants_joint = self._improvements.joint
 
     @property
     def best_cost(self) -> float:
@@ -142,13 +145,24 @@ class Tappa(Search):
 
     def _limit(self) -> float:
         """Continue the joint search, then return the cost that a path set must be below."""
-        joint = self._joint
-        if joint is not None and not joint.ended and self._budget.nodes >= _JOINT_AFTER:
-            joint.work(min(self._budget.nodes, _MAX_JOINT_MOVES_PER_NODE))
-            self._update_best(joint.solution)
+        if self._wants_joint and self._budget.nodes >= _JOINT_AFTER:
+            self._joint, self._wants_joint = self._new_joint_search(), False
+        if self._joint is not None and not self._joint.ended:
+            self._joint.work(_JOINT_MOVES_PER_NODE, self.best_cost)
+            self._update_best(self._joint.solution)
         if self.best_cost <= self.joint_bound:
             return -math.inf
         return self.best_cost if self._improvements.cutoff else math.inf
+
+    def _new_joint_search(self) -> JointSearch | None:
+        """Return the joint search, or None if it is not compiled and must not be."""
+        with self._budget.paused():
+            if not BRANCHING.available(compiled_only=self._budget.compiled_only):
+                return None
+            from laneweave.coordinator.planning.exact.joint_search import (  # noqa: PLC0415
+                JointSearch,
+            )
+        return JointSearch(self._problem, self._choices, self._budget)
 
 
 def new_search(request: PlanRequest, problem: Problem, weights: Weights, budget: Budget) -> Search:

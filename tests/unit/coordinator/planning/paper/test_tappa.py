@@ -7,6 +7,7 @@ import pytest
 
 from laneweave.coordinator.planning.budget import Budget
 from laneweave.coordinator.planning.paper.assignments import Weights
+from laneweave.coordinator.planning.paper.cbs import Improvements
 from laneweave.coordinator.planning.paper.tappa import Tappa
 from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.coordinator.planning.solve import plan
@@ -16,8 +17,9 @@ from oracles.instances import random_request
 @pytest.mark.parametrize("seed", [83, 103, 129])
 def test_an_assignment_without_a_better_path_set_does_not_end_the_search(seed: int) -> None:
     request = PlanRequest.from_dict(random_request(seed))
-    weights, budget = Weights.for_mode(request.mode), Budget(max_nodes=400)
-    search = Tappa(request, request.problem(), weights, budget, record=True)
+    weights, budget = Weights.for_mode(request.mode), Budget(max_nodes=4000)
+    without = attrs.evolve(Improvements(), joint=False)
+    search = Tappa(request, request.problem(), weights, budget, without, record=True)
 
     search.run()
 
