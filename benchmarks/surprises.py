@@ -112,10 +112,10 @@ def _points() -> Iterator[Point]:
     for label in OPERATIONS:
         for ahead_m, clear_s in ((300, 20.0), (50, 10.0 / 3.0)):
             event = {**CLOSING, "clear_s": clear_s}
-            yield Point(f"closed {ahead_m} m ahead", label, 1450, event=event)
+            yield Point(f"closed {ahead_m} m ahead", label, 1450, event=event, seeds=3)
         for speed_mps in (5.0, 10.0):
             event = {**PASSING, **_body(500.0), "speed_mps": speed_mps}
-            yield Point(f"slow {speed_mps:g} m/s", label, 1450, event=event)
+            yield Point(f"slow {speed_mps:g} m/s", label, 1450, event=event, seeds=3)
         event = {**PASSING, **_body(0.0), "speed_mps": 25.0}
         yield Point("emergency 25 m/s", label, 1450, event=event)
 
