@@ -441,6 +441,8 @@ def _more(name: str, run: dict[str, Any]) -> Iterator[str]:
         times = run[key]
         if times["count"]:
             yield f"{words} after {times['p50']:.2f} s (p50), {times['p99']:.2f} s (p99)"
+    if (planned_s := run.get("planned_after_s")) is not None:
+        yield f"{run['stopped']} stopped, first plan around the vehicle after {planned_s:.2f} s"
     if run["replanned"]:
         yield f"{run['replanned']} repeated plans"
     if not name.startswith("rolling-"):  # these have no real time
