@@ -42,7 +42,7 @@ _FAR_M = 1000.0
 
 
 class Conditions(Hashable, Protocol):
-    """What re-entry depends on; a scenario has it."""
+    """The settings that determine re-entry; a `Scenario` contains them."""
 
     @property
     def lattice(self) -> Lattice:

@@ -47,7 +47,7 @@ class ClosedParts(Protocol):
         """Return the parts whose cause is not over at a road time."""
 
     def without_vehicles(self, t_s: float) -> Sequence[TemporaryClosure]:
-        """Return those in which no vehicle may be."""
+        """Return the parts from which all vehicles are kept out at a road time."""
 
 
 class WaitingBody(BodyOnRoad, Protocol):

@@ -23,7 +23,6 @@ from laneweave.coordinator.planning.exact.joint_kernel import (
     add_goals,
     fill_slots,
     search,
-    steps_from,
 )
 from laneweave.coordinator.planning.kernels import BRANCHING, KERNELS, _without_compiling
 from laneweave.coordinator.planning.paper import tappa
@@ -255,7 +254,7 @@ def test_all_kernels_that_plans_use_are_loaded() -> None:
 def test_loading_calls_the_kernels_of_the_joint_search() -> None:
     """Otherwise the first plan that needs one of them would compile it."""
     BRANCHING.load()
-    called = (steps_from, add_goals, fill_slots, search)
+    called = (add_goals, fill_slots, search)
     assert all(kernel.signatures for kernel in called)
 
 

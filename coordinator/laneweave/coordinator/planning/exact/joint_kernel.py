@@ -21,36 +21,6 @@ _COST_BITS, _STATE_BITS = 15, 32
 
 
 @njit(cache=True, nogil=True)
-def steps_from(arrays, team, starts):
-    """Return (X,) the least number of steps from the nearest start to each cell; -1: no path."""
-    displacements, cells = arrays.from_cell.shape
-    steps = np.full(cells, -1)
-    reached = np.empty(cells, np.int64)
-    count = 0
-    for cell in starts:
-        if steps[cell] < 0:
-            steps[cell] = 0
-            reached[count] = cell
-            count += 1
-    done = 0
-    while done < count:
-        cell = reached[done]
-        done += 1
-        for d in range(displacements):
-            to = cell + arrays.step[d]
-            if (
-                0 <= to < cells
-                and arrays.from_cell[d, to] == cell
-                and arrays.drives[team, d]
-                and steps[to] < 0
-            ):
-                steps[to] = steps[cell] + 1
-                reached[count] = to
-                count += 1
-    return steps
-
-
-@njit(cache=True, nogil=True)
 def add_goals(arrays, store, progress, slot_team, eligible):
     """Open a state for each choice of targets from which the start can be reached.
 
@@ -152,10 +122,10 @@ def _begin(arrays, codes, progress):
 
 @njit(cache=True)
 def _expand(arrays, store, progress, below, work):
-    """Open the states before the current one whose F is that of its expansion.
+    """Open those predecessors of the current state that have the F of its expansion.
 
-    Returns the number of moves that were tried. The state is opened again with the next F once all
-    have been.
+    Returns the number of moves that were tried. After the last move, the state is opened again with
+    the next higher F.
     """
     head, choice = progress.head, progress.choice
     state, bound, depth = head[CURRENT], head[EXPANDED_AT], head[DEPTH]
@@ -234,10 +204,10 @@ def _conflicts(arrays, progress, vehicle, origin, d):
 
 @njit(cache=True)
 def _open(store, progress, code, bound, cost, after, made):
-    """Open a state, given by codes in any order, unless it is known: then it costs no more.
+    """Open a state, given by codes in any order, unless it is known.
 
-    For the rest is the same, and F never falls. after: the state that follows, or -1; made: the
-    displacements on the way to that one, in its order.
+    A known state was reached at no higher cost, because states are opened in ascending order of F.
+    after: the state that follows, or -1; made: the displacements on the way to it, in its order.
     """
     head, codes = progress.head, progress.ordered
     vehicles = len(codes)

@@ -45,7 +45,6 @@ from laneweave.coordinator.planning.exact.joint_kernel import (
     add_goals,
     fill_slots,
     search,
-    steps_from,
 )
 from laneweave.coordinator.planning.problem import MoveTable, Problem, Solution
 from laneweave.protocol.lattice import Mode
@@ -98,7 +97,7 @@ class Store(NamedTuple):
     made: Ints
     """(S, N) displacements on the way to the state that follows, in its order."""
     heap: Ints
-    """Keys of the open list."""
+    """Binary heap of the keys of open states."""
     slot: Ints
     """Hash table: the state in each slot; -1: free."""
 
@@ -219,7 +218,7 @@ class JointSearch:
                 self.ended = True
 
     def _end(self, bound: float) -> None:
-        """End without a path set that costs less than a bound."""
+        """End the search: no path set costs less than the bound."""
         self.ended = True
         proven = min(bound, MAX_COST) if self._progress.head[CUT] else bound
         self.lower_bound = max(self.lower_bound, proven)
@@ -293,7 +292,16 @@ def _joint_moves(
     base = 2 * len(excluded)
     start = sorted(start * base + 2 * k + 1 for start, k in zip(starts, team, strict=True))
     reach, conflicts = _conflicts(table.mode, table.model)
-    moves = JointMoves(
+    steps = np.full((len(excluded), cells), -1)
+    for number, not_driven in enumerate(excluded):
+        of_team = {
+            table.bit(divmod(c, lanes)) for c, k in zip(starts, team, strict=True) if k == number
+        }
+        undrivable = table.with_displacements(not_driven)
+        for cell, distance in table.distances(sum(1 << bit for bit in of_team), undrivable).items():
+            column, lane = table.cell(cell)
+            steps[number, column * lanes + lane] = distance
+    return JointMoves(
         lanes,
         base,
         step,
@@ -302,12 +310,8 @@ def _joint_moves(
         reach,
         conflicts,
         np.array(start),
-        np.zeros((len(excluded), cells), np.int64),
+        steps,
     )
-    for number in range(len(excluded)):
-        of_team = [start for start, k in zip(starts, team, strict=True) if k == number]
-        moves.steps[number] = steps_from(moves, number, np.array(of_team))
-    return moves
 
 
 @lru_cache(maxsize=16)
