@@ -7,8 +7,10 @@ from typing import Any
 
 from oracles.path_rules import Cell, Move, Path, Problem
 
-State = tuple[tuple[Cell, bool], ...]
+Stays = tuple[tuple[Cell, bool], ...]
 """For each vehicle its cell, and whether it stays there for ever; such a vehicle costs nothing."""
+State = tuple[Stays, int]
+"""The same, and the number of steps so far if it is limited, otherwise 0."""
 
 
 def optimal_cost(request: dict[str, Any]) -> int | None:
@@ -19,7 +21,7 @@ def optimal_cost(request: dict[str, Any]) -> int | None:
 
 def optimal_response(request: dict[str, Any]) -> dict[str, Any] | None:
     problem = Problem.of(request)
-    start: State = tuple((cell, False) for cell in problem.starts)
+    start: State = tuple((cell, False) for cell in problem.starts), 0
     came_from: dict[State, State | None] = {}
     order = count()
     queue: list[tuple[int, int, State, State | None]] = [(0, next(order), start, None)]
@@ -28,7 +30,7 @@ def optimal_response(request: dict[str, Any]) -> dict[str, Any] | None:
         if state in came_from:
             continue
         came_from[state] = before
-        if all(stays for _, stays in state):
+        if all(stays for _, stays in state[0]):
             return _response(problem, cost, state, came_from)
         for step_cost, following in _successors(problem, state):
             if following not in came_from:
@@ -37,22 +39,27 @@ def optimal_response(request: dict[str, Any]) -> dict[str, Any] | None:
 
 
 def _successors(problem: Problem, state: State) -> Iterator[tuple[int, State]]:
-    for i, (cell, stays) in enumerate(state):
-        if not stays and _may_stay(problem, state, i):
-            yield 0, (*state[:i], (cell, True), *state[i + 1 :])
-    moving = sum(not stays for _, stays in state)
-    for moves in _joint_moves(problem, state, ()):
-        pairs = zip(moves, state, strict=True)
-        yield moving, tuple((move[1], stays) for move, (_, stays) in pairs)
+    cells, steps = state
+    for i, (cell, stays) in enumerate(cells):
+        if not stays and _may_stay(problem, cells, i):
+            yield 0, ((*cells[:i], (cell, True), *cells[i + 1 :]), steps)
+    moving = sum(not stays for _, stays in cells)
+    if problem.max_steps is not None:
+        steps += 1
+        if steps > problem.max_steps:
+            return
+    for moves in _joint_moves(problem, cells, ()):
+        pairs = zip(moves, cells, strict=True)
+        yield moving, (tuple((move[1], stays) for move, (_, stays) in pairs), steps)
 
 
-def _may_stay(problem: Problem, state: State, i: int) -> bool:
+def _may_stay(problem: Problem, state: Stays, i: int) -> bool:
     cell = state[i][0]
     return cell in {problem.targets[j] for j in problem.eligible[i]} and (cell, True) not in state
 
 
 def _joint_moves(
-    problem: Problem, state: State, chosen: tuple[Move, ...]
+    problem: Problem, state: Stays, chosen: tuple[Move, ...]
 ) -> Iterator[tuple[Move, ...]]:
     if len(chosen) == len(state):
         yield chosen
@@ -69,16 +76,16 @@ def _joint_moves(
 def _response(
     problem: Problem, cost: int, goal: State, came_from: dict[State, State | None]
 ) -> dict[str, Any]:
-    states: list[State] = []
+    states: list[Stays] = []
     state: State | None = goal
     while state is not None:
         previous = came_from[state]
         # Steps keep the flags; a transition that sets one takes no time.
         if previous is None or _flags(previous) == _flags(state):
-            states.append(state)
+            states.append(state[0])
         state = previous
     states.reverse()
-    paths: list[Path] = [[s[i][0] for s in states] for i in range(len(goal))]
+    paths: list[Path] = [[s[i][0] for s in states] for i in range(len(goal[0]))]
     return {
         "cost": cost,
         "lower_bound": cost,
@@ -89,4 +96,4 @@ def _response(
 
 
 def _flags(state: State) -> list[bool]:
-    return [stays for _, stays in state]
+    return [stays for _, stays in state[0]]

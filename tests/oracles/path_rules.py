@@ -178,6 +178,8 @@ class Problem:
     bodies: Bodies | None = None
     drivable: tuple[frozenset[Cell] | None, ...] = ()
     """For each vehicle the displacements that it can drive; None: all of the mode."""
+    max_steps: int | None = None
+    """Maximum number of steps; None: any number."""
 
     @classmethod
     def of(cls, request: dict[str, Any]) -> "Problem":
@@ -205,6 +207,7 @@ class Problem:
                 frozenset(map(_cell, vehicle["moves"])) if "moves" in vehicle else None
                 for vehicle in request["vehicles"]
             ),
+            max_steps=request.get("max_steps"),
         )
 
     def is_free(self, cell: Cell) -> bool:
@@ -271,6 +274,8 @@ def check_paths(request: dict[str, Any], response: dict[str, Any]) -> list[str]:
         return [f"{count} vehicles, {len(paths)} paths, {len(assignment)} assigned targets"]
     if any(len(path) != response["steps"] + 1 for path in paths):
         return [f"steps {response['steps']}, lengths of paths {[len(path) for path in paths]}"]
+    if problem.max_steps is not None and response["steps"] > problem.max_steps:
+        return [f"{response['steps']} steps, permitted are {problem.max_steps}"]
     return [
         *_wrong_assignment(problem, assignment, paths),
         *_wrong_moves(problem, paths),

@@ -1,4 +1,4 @@
-"""Scenarios of tests that mean the paper's operation: interlaced blocks of columns, T_F = 4 s."""
+"""Scenarios of tests that mean the paper's formations (`PAPERS_FORMATIONS`)."""
 
 from __future__ import annotations
 
@@ -7,14 +7,13 @@ from collections.abc import Iterable
 from attrs import evolve, fields
 
 from laneweave.protocol.scenario.fields import Scenario
-from laneweave.protocol.scenario.formation_table import FormationSettings
+from laneweave.protocol.scenario.formation_table import PAPERS_FORMATIONS, FormationSettings
 from laneweave.protocol.scenario.vehicle_tables import Sensing
+from laneweave.protocol.structuring import structure
 from laneweave.protocol.wire.messages import CensusEntry, ClosedFormation
 from laneweave.sim_bridge.road.formation_building import formation_builder
 
-FORMATIONS = FormationSettings(
-    operation="formations", entry="interlaced", close="columns", cycle_s=4.0
-)
+FORMATIONS = structure({"operation": "formations", **PAPERS_FORMATIONS}, FormationSettings)
 PAPER = Scenario(formation=FORMATIONS)
 EXACT = Sensing(**dict.fromkeys((field.name for field in fields(Sensing)), 0.0))
 """Sensors without errors."""
@@ -22,7 +21,7 @@ EXACT = Sensing(**dict.fromkeys((field.name for field in fields(Sensing)), 0.0))
 
 def paper(scenario: Scenario) -> Scenario:
     """Return a scenario in the paper's operation."""
-    names = ("operation", "entry", "close", "cycle_s")
+    names = ("operation", *PAPERS_FORMATIONS)
     changes = {name: getattr(FORMATIONS, name) for name in names}
     return evolve(scenario, formation=evolve(scenario.formation, **changes))
 

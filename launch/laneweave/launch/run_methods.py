@@ -63,11 +63,12 @@ _FORMATIONS: Final = FormationSettings()
 
 def _default() -> LabelledMethod:
     """Return formation control with the default settings, regardless of the scenario."""
-    names = ("operation", "entry", "close", "cycle_s", "move_s", "max_vehicles", "max_columns")
+    names = (
+        "operation", "entry", "close", "cycle_s", "move_s", "max_vehicles", "max_columns", "targets",
+        "solver",
+    )  # fmt: skip
     return LabelledMethod(
-        FORMATION,
-        {f"formation.{name}": getattr(_FORMATIONS, name) for name in names}
-        | _solver(_FORMATIONS.max_vehicles),
+        FORMATION, {f"formation.{name}": getattr(_FORMATIONS, name) for name in names}
     )
 
 
@@ -81,14 +82,9 @@ def _paper(max_vehicles: int, block_columns: int) -> LabelledMethod:
             "formation.move_s": None,
             "formation.max_vehicles": max_vehicles,
             "formation.block_columns": block_columns,
-        }
-        | _solver(max_vehicles),
+            "formation.solver": "tappa" if max_vehicles <= MAX_TAPPA_VEHICLES else "branching",
+        },
     )
-
-
-def _solver(max_vehicles: int) -> dict[str, object]:
-    """Return the solver setting for formations of at most `max_vehicles`."""
-    return {"formation.solver": "tappa" if max_vehicles <= MAX_TAPPA_VEHICLES else "branching"}
 
 
 _SUMO_HUMAN: Final = {

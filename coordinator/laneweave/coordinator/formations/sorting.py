@@ -1,12 +1,12 @@
 """Lane sorting of one formation, or of joined ones: from promises to moves.
 
 The grid consists of the blocks of the formations, in the lanes that are open. Vehicles without an
-agent block their cells. If every vehicle has one goal lane, all can change columns, and no lane
-ends, they form the parallel structure. Otherwise they take any cells of their goal lanes; vehicles
-that cannot change columns take those in their own columns. If complete sorting is infeasible, one
-vehicle is exempted from reaching its lane, so that a single blocked vehicle does not prevent all
-others from sorting; the vehicles are tried one by one. Before sorting, a formation may form other
-structures, in which every vehicle may take any place.
+agent block their cells. Vehicles take any cells of their goal lanes; those that cannot change
+columns take cells in their own columns. With `formation.targets = "parallel"` they form the
+parallel structure instead, if every vehicle has one goal lane, all can change columns, and no lane
+ends. If complete sorting is infeasible, one vehicle is exempted from reaching its lane, so that a
+single blocked vehicle does not prevent all others from sorting; the vehicles are tried one by one.
+Before sorting, a formation may form other structures, in which every vehicle may take any place.
 """
 
 from __future__ import annotations
@@ -25,7 +25,6 @@ from laneweave.coordinator.planning.grid import Grid
 from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
 from laneweave.coordinator.planning.response import PlanFunction, PlanResponse
 from laneweave.coordinator.planning.targets import (
-    assign_nearby,
     choose_lanes,
     placements,
     reachable_lanes,
@@ -38,7 +37,10 @@ from laneweave.protocol.wire.messages import Name
 from laneweave.protocol.wire.reasons import BLOCKED, CLOSED_LANE, NO_AGENT, NO_ROOM, TOO_LATE
 
 MAX_PLACEMENTS = 6
-"""Maximum number of target placements to try if the first one takes too many steps."""
+"""Maximum number of parallel structures to try if the first one takes too many steps."""
+MAX_EXTRA_STEPS = 4
+"""If a plan into lanes takes too many steps, plans with at most as many as fit are sought, then with
+one more, and so on, up to this number of plans."""
 MIN_DEADLINE_S = 0.05
 """Minimum deadline for one attempt."""
 
@@ -186,12 +188,16 @@ def plan_requests(task: SortingTask, exempt: Name | None = None) -> Iterator[Pla
     }
     lanes_end = task.stage is not None and bool(task.stage.ending_lanes)
     all_free = task.column_bound.isdisjoint(wanted)
-    if not lanes_end and all_free and all(len(lanes) == 1 for lanes in wanted.values()):
-        yield from _into_parallel_structure(
-            task, {name: min(each) for name, each in wanted.items()}
-        )
+    one_each = all(len(lanes) == 1 for lanes in wanted.values())
+    parallel = task.scenario.formation.targets == "parallel"
+    if parallel and not lanes_end and all_free and one_each:
+        lane_of = {name: min(each) for name, each in wanted.items()}
+        yield from islice(_into_parallel_structure(task, lane_of), MAX_PLACEMENTS)
     else:
-        yield from _into_lanes(task, wanted)
+        request = _into_lanes(task, wanted)
+        yield request
+        for steps in range(task.steps, task.steps + MAX_EXTRA_STEPS):
+            yield evolve(request, max_steps=steps)
 
 
 def _into_parallel_structure(
@@ -217,13 +223,11 @@ def _into_parallel_structure(
         yield _plan_request(task, vehicles, targets.cells)
 
 
-def _into_lanes(task: SortingTask, wanted: Mapping[Name, frozenset[int]]) -> Iterator[PlanRequest]:
-    """Yield the request in which each vehicle may take any free cell of its goal lanes.
+def _into_lanes(task: SortingTask, wanted: Mapping[Name, frozenset[int]]) -> PlanRequest:
+    """Return the request in which each vehicle may take any free cell of its goal lanes.
 
     Vehicles for which these have too few cells may take any cell of the lanes that go on; those
-    that cannot change columns and reach no goal lane, any cell of their columns. In the second
-    request every vehicle has one target, so that no path is long: such plans may have fewer
-    steps.
+    that cannot change columns and reach no goal lane, any cell of their columns.
     """
     free = task.free
     through = task.open_lanes if task.stage is None else task.stage.through_lanes
@@ -231,20 +235,19 @@ def _into_lanes(task: SortingTask, wanted: Mapping[Name, frozenset[int]]) -> Ite
     possible = reachable_lanes(task.movers, wanted, column_bound, free)
     chosen = choose_lanes(task.movers, possible, through, free, column_bound)
     targets = tuple(cell for cell in free if any(cell[1] in lanes for lanes in chosen.values()))
-    eligible = {
-        name: tuple(
-            number
-            for number, (column, lane) in enumerate(targets)
-            if lane in lanes and (name not in column_bound or column == task.movers[name][0])
+    vehicles = [
+        VehicleRequest(
+            name,
+            cell,
+            eligible=tuple(
+                number
+                for number, (column, lane) in enumerate(targets)
+                if lane in chosen[name] and (name not in column_bound or column == cell[0])
+            ),
         )
-        for name, lanes in chosen.items()
-    }
-    nearby = assign_nearby(task.movers, eligible, targets)
-    for each in eligible, {name: (number,) for name, number in nearby.items()}:
-        vehicles = [
-            VehicleRequest(name, cell, eligible=each[name]) for name, cell in task.movers.items()
-        ]
-        yield _plan_request(task, vehicles, targets)
+        for name, cell in task.movers.items()
+    ]
+    return _plan_request(task, vehicles, targets)
 
 
 def _plan_request(
@@ -296,18 +299,23 @@ def sort_lanes(
     ends_s = clock() + task.deadline_s
     for exempt in (None, *task.movers):
         best: PlanResponse | None = None
-        for request in islice(plan_requests(task, exempt), MAX_PLACEMENTS):
+        for request in plan_requests(task, exempt):
             left_s = ends_s - clock()
-            if best is not None and left_s <= MIN_DEADLINE_S:
+            if best is not None and (left_s <= MIN_DEADLINE_S or _steps(best) <= _limit(request)):
                 break
             response = make_plan(evolve(request, deadline_s=max(left_s, MIN_DEADLINE_S)))
             if best is None or _steps(response) < _steps(best):
                 best = response
-            if _steps(best) <= task.steps or not response.paths:
+            if _steps(best) <= task.steps or not (response.paths or request.max_steps):
                 break
         if best is not None and best.status != "infeasible":
             break
     return _sorting(task, best)
+
+
+def _limit(request: PlanRequest) -> float:
+    """Return the maximum number of steps of the plans that answer a request."""
+    return 0 if request.max_steps is None else request.max_steps
 
 
 def _steps(response: PlanResponse) -> float:

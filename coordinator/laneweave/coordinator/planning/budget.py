@@ -73,6 +73,11 @@ class Budget:
             if self._deadline is not None:
                 self._deadline += paused_s
 
+    @property
+    def left_s(self) -> float:
+        """Return the time until the deadline; infinite: there is none."""
+        return math.inf if self._deadline is None else self._deadline - self._clock()
+
     def take_node(self) -> None:
         """Count one node, or raise `BudgetSpentError` if none is left."""
         self.check_time()
@@ -92,6 +97,5 @@ class Budget:
         left = math.inf
         if self._max_nodes is not None:
             left = self._max_nodes - self.nodes
-        if self._deadline is not None:
-            left = min(left, (self._deadline - self._clock()) / max(s_per_node, 1e-6))
+        left = min(left, self.left_s / max(s_per_node, 1e-6))
         return max(0, int(min(left, sys.maxsize)))

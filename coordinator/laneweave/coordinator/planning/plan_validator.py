@@ -46,6 +46,9 @@ def problems_of_paths(
     problems = list(_problems_of_shape(request, assignment, paths))
     if problems:
         return problems
+    steps = len(paths[0]) - 1
+    if request.max_steps is not None and steps > request.max_steps:
+        problems.append(f"{steps} steps, but at most {request.max_steps} are permitted")
     for i, vehicle in enumerate(request.vehicles):
         problems += _problems_of_vehicle(request, vehicle, assignment[i], paths[i])
     for i, j in combinations(range(len(assignment)), 2):

@@ -11,10 +11,12 @@ bits of their waits. Ties go to the lowest bit.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from typing import Final
 
 import attrs
+import numpy as np
 
 from laneweave.coordinator.planning.conflict_kinds import ConflictModel, Move, conflict_offsets
 from laneweave.coordinator.planning.grid import Grid
@@ -23,12 +25,18 @@ from laneweave.protocol.lattice import Cell, Mode, displacements
 Path = tuple[int, ...]
 """The moves of one vehicle until its final arrival."""
 
+_MAX_LOOPED_BITS: Final = 1 << 10
+"""Size in bits above which taking bits off one by one is slow, because each copies the rest."""
 _MAX_CACHED_BITS: Final = 1 << 15
 """Size in bits above which conflict sets are not cached."""
 
 
 def bits(mask: int) -> Iterator[int]:
     """Yield the indices of the set bits, lowest first."""
+    if mask.bit_length() > _MAX_LOOPED_BITS:
+        octets = np.frombuffer(mask.to_bytes(-(-mask.bit_length() // 8), "little"), np.uint8)
+        yield from np.flatnonzero(np.unpackbits(octets, bitorder="little")).tolist()
+        return
     while mask:
         low = mask & -mask
         yield low.bit_length() - 1
@@ -256,6 +264,7 @@ class Problem:
     starts, targets: bit indices of the start cells and of the target cells.
     excluded: the displacements that each vehicle cannot drive, by index.
     undrivable: the moves that each vehicle cannot drive.
+    max_steps: maximum number of steps of a path set; None: any number.
     free_paths: cache of `shortest_paths.free_paths`, shared by all constraint trees.
     """
 
@@ -267,6 +276,7 @@ class Problem:
         starts: Sequence[Cell],
         targets: Sequence[Cell],
         drivable: Sequence[Collection[Cell] | None] | None = None,
+        max_steps: int | None = None,
     ) -> None:
         """Number the moves of the grid.
 
@@ -278,6 +288,7 @@ class Problem:
             targets: target cells.
             drivable: moves (columns, lanes) that each vehicle can drive; None, for a vehicle or
                 for all: all moves of the mode.
+            max_steps: maximum number of steps of a path set; None: any number.
         """
         self.table = MoveTable(grid, mode, model)
         self.starts = tuple(self.table.bit(cell) for cell in starts)
@@ -289,8 +300,19 @@ class Problem:
             )
             for moves in ((None,) * len(starts) if drivable is None else drivable)
         )
+        self.max_steps = max_steps
         self.undrivable = tuple(map(self.table.with_displacements, self.excluded))
         self.free_paths: dict[tuple[int, int], Diagram | None] = {}
+
+    def is_too_long(self, solution: Solution) -> bool:
+        """Return whether a path set has more steps than are permitted."""
+        most = max(map(len, solution.paths), default=0)
+        return self.max_steps is not None and most > self.max_steps
+
+    @property
+    def max_cost(self) -> float:
+        """The cost that no path set exceeds; infinite if its number of steps is not limited."""
+        return math.inf if self.max_steps is None else len(self.starts) * self.max_steps
 
     def cells_of(self, solution: Solution) -> list[list[Cell]]:
         """Return the paths as cells, each beginning at the vehicle's start."""

@@ -49,6 +49,7 @@ MAX_VEHICLES: Final = 200
 MAX_TARGETS: Final = 400
 MAX_ID_LENGTH: Final = 100
 MAX_DEADLINE_S: Final = 3600.0
+MAX_STEPS: Final = 1_000_000
 
 _KNOWN_KEYS: Final = "only known keys"
 _NOT_BOTH: Final = "structure or targets, not both"
@@ -82,6 +83,7 @@ class PlanRequest:
     targets: empty if a structure is given.
     structure: one of `STRUCTURES` (`formation_structures`); its cells are the targets.
     lanes: lanes of the structure; None: all.
+    max_steps: maximum number of steps of the plan; None: any number.
     geometry: defines the conflict kind `geometric`; None: footprints.
     solver: name of a solver, built in or a plug-in where the request is answered; None: the
         default there.
@@ -99,6 +101,7 @@ class PlanRequest:
     solver: str | None = None
     structure: str | None = None
     lanes: tuple[int, ...] | None = None
+    max_steps: int | None = None
 
     def __attrs_post_init__(self) -> None:
         """Reject inconsistent requests.
@@ -118,7 +121,8 @@ class PlanRequest:
         """Return the problem in the form that the searches use."""
         starts = [vehicle.cell for vehicle in self.vehicles]
         drivable = [vehicle.moves for vehicle in self.vehicles]
-        return Problem(self.grid, self.mode, self.conflict_model, starts, self.targets, drivable)
+        model, steps = self.conflict_model, self.max_steps
+        return Problem(self.grid, self.mode, model, starts, self.targets, drivable, steps)
 
     def choices(self) -> list[frozenset[int]]:
         """Return, per vehicle, the indices of the targets it may be assigned to."""
@@ -210,6 +214,7 @@ class _Document:
     solver: str | None = None
     structure: str | None = None
     lanes: tuple[int, ...] | None = None
+    max_steps: int | None = None
 
     def fields(self) -> dict[str, Any]:
         """Return the arguments of a `PlanRequest`, which checks them."""
@@ -346,6 +351,8 @@ def _rule_problems(request: PlanRequest) -> Iterator[BadInputError]:
     if not (math.isfinite(request.deadline_s) and 0 < request.deadline_s <= MAX_DEADLINE_S):
         allowed = f"a number above 0, at most {MAX_DEADLINE_S:g}"
         yield BadInputError("deadline_s", request.deadline_s, allowed)
+    if request.max_steps is not None:
+        yield from _out_of_range("max_steps", request.max_steps, 0, MAX_STEPS)
 
 
 def _cell_problems(request: PlanRequest) -> Iterator[BadInputError]:

@@ -13,7 +13,15 @@ from collections.abc import Sequence
 import attrs
 
 from laneweave.coordinator.planning.budget import Budget, BudgetSpentError
-from laneweave.coordinator.planning.problem import Bans, Diagram, MoveTable, Path, Problem, Solution
+from laneweave.coordinator.planning.problem import (
+    Bans,
+    Diagram,
+    MoveTable,
+    Path,
+    Problem,
+    Solution,
+    bits,
+)
 
 
 def shortest_paths(table: MoveTable, start: int, target: int, bans: Bans) -> Diagram | None:
@@ -50,7 +58,13 @@ def shortest_paths(table: MoveTable, start: int, target: int, bans: Bans) -> Dia
 
 
 def paths_of(problem: Problem, vehicle: int, target: int, bans: Bans) -> Diagram | None:
-    """Return a vehicle's shortest paths to a target cell with the moves that it can drive."""
+    """Return a vehicle's shortest paths to a target cell with the moves that it can drive.
+
+    A path has at most the number of steps that the problem permits.
+    """
+    if problem.max_steps is not None:
+        latest = problem.max_steps if bans.latest is None else min(bans.latest, problem.max_steps)
+        bans = attrs.evolve(bans, latest=latest)
     if undrivable := problem.undrivable[vehicle]:
         since = {**bans.since, 0: bans.since.get(0, 0) | undrivable}
         bans = attrs.evolve(bans, since=since)
@@ -88,19 +102,17 @@ def choose_path(table: MoveTable, diagram: Diagram, conflicting: Sequence[int]) 
     cost_to_go = {diagram.target: 0}
     choices: list[dict[int, int]] = []
     for step in range(diagram.cost - 1, -1, -1):
-        layer, bad = diagram.layers[step], conflicting[step]
+        layer = diagram.layers[step]
+        bad = {*bits(layer & conflicting[step])}
         cost_before: dict[int, int] = {}
         choice: dict[int, int] = {}
-        while layer:
-            low = layer & -layer
-            layer ^= low
-            bit = low.bit_length() - 1
+        for bit in bits(layer):
             d = bit % fan
             cell = bit - d
             value = cost_to_go[cell + shifts[d]]
             if d:
                 value += 1
-            if bad & low:
+            if bit in bad:
                 value += conflict_weight
             if cell not in cost_before or value < cost_before[cell]:
                 cost_before[cell] = value

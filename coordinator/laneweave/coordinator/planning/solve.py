@@ -15,13 +15,12 @@ from laneweave.coordinator.planning.kernels import BRANCHING
 from laneweave.coordinator.planning.paper.assignments import Weights
 from laneweave.coordinator.planning.path_map import RelativePathMap
 from laneweave.coordinator.planning.plan_validator import problems_of_response
-from laneweave.coordinator.planning.plug_ins.registry import PLANNERS, PlanLimits, checked_solver
+from laneweave.coordinator.planning.plug_ins.registry import PLANNERS, PlanLimits, check_solver
 from laneweave.coordinator.planning.plug_ins.search import PluggedInSearch
 from laneweave.coordinator.planning.problem import Problem, Search
 from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.coordinator.planning.response import PlanResponse, Status
 from laneweave.coordinator.planning.shortest_paths import without_needless_moves
-from laneweave.protocol.scenario.formation_table import DEFAULT_SOLVER
 
 TAPPA_SHARE: Final = 0.75
 """Share of the deadline, and of the node limit, after which branching replaces TAPPA.
@@ -66,8 +65,8 @@ def plan(
         max_memory_mb: limit on the arrays of branch and bound. When it is reached, the other
             solver continues; a path set that is not proven optimal has status `feasible`.
         weights: weights that make the formation relative distance a lower bound on steps.
-        solver: name of a solver or plug-in, overriding the request's; if neither names one, the
-            default.
+        solver: name of a solver or plug-in, overriding the request's; if neither names one, one
+            is chosen (docs/PLANNING.md, "Which solver plans").
         fallback: branching continues when TAPPA has spent `TAPPA_SHARE`, and the cheaper path set
             is returned; False: TAPPA may spend the whole budget. A solver that cannot handle the
             request at all, or a plug-in without a valid plan, is always replaced by others.
@@ -83,7 +82,8 @@ def plan(
     """
     started, began_s = clock(), time.monotonic()
     original, request = request, request.resolved()
-    requested = checked_solver(solver or request.solver or DEFAULT_SOLVER)
+    requested = solver or request.solver
+    check_solver(requested)
     weights = (weights or Weights.for_mode(request.mode)).checked(request.mode)
     nodes = MAX_NODES if max_nodes is None else min(max_nodes, MAX_NODES)
     problem = request.problem()
@@ -117,7 +117,7 @@ def plan(
         if results[-1].found.finished or not (results[-1].found.aborted or is_limited):
             break
     rest = Budget(deadline=started + request.deadline_s, clock=clock)
-    response = _response(request, problem, requested, results, rest, began_s)
+    response = _response(request, problem, requested or results[0].solver, results, rest, began_s)
     if original.structure is not None:
         response = attrs.evolve(response, targets=request.targets)
     problems = problems_of_response(original, response)
@@ -126,15 +126,15 @@ def plan(
     return response
 
 
-def _order(requested: str, problem: Problem, *, fallback: bool) -> tuple[str, ...]:
+def _order(requested: str | None, problem: Problem, *, fallback: bool) -> tuple[str, ...]:
     """Return the solvers in the order in which to run them."""
-    if not PLANNERS.is_built_in(requested):
-        return (requested, *_order("tappa", problem, fallback=fallback))
+    if requested is not None and not PLANNERS.is_built_in(requested):
+        return (requested, *_order(None, problem, fallback=fallback))
     if problem.table.model.vehicles_share_cells:
         return ("tappa",)
     if requested == "tappa":
         return ("tappa", "branching") if fallback else ("tappa",)
-    return (requested, "tappa")
+    return ("branching", "tappa")
 
 
 def _load(solver: str, *, compiled_only: bool) -> bool:
@@ -213,19 +213,19 @@ def _status(*, found: bool, finished: bool) -> Status:
     return "infeasible" if finished else "timeout"
 
 
-def prepare(solver: str, field: str = "solver", *, keep: bool = True) -> None:
+def prepare(solver: str | None, field: str = "solver", *, keep: bool = True) -> None:
     """Check that a solver exists; start the process of a plug-in, which imports it.
 
     Args:
-        solver: name of the solver.
+        solver: name of the solver; None: none is named.
         field: field or option that contains it.
         keep: whether the process goes on, for plans of this process.
 
     Raises:
         BadInputError: there is no such solver, or it cannot be loaded.
     """
-    checked_solver(solver, field)
-    if not PLANNERS.is_built_in(solver):
+    check_solver(solver, field)
+    if solver is not None and not PLANNERS.is_built_in(solver):
         from laneweave.coordinator.planning.plug_ins import process  # noqa: PLC0415
 
         process.load_planner(solver, field)

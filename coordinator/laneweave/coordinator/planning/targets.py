@@ -1,7 +1,7 @@
 """Targets of a formation that sorts its lanes.
 
 - `placements`: the parallel structure (paper, Section 5.2.1).
-- `choose_lanes`, `reachable_lanes`, `assign_nearby`: any cells of the goal lanes.
+- `choose_lanes`, `reachable_lanes`: any cells of the goal lanes.
 
 In the parallel structure each lane provides neighbouring cells, one per vehicle that prefers the
 lane, where paths are shortest. Vehicles without an agent keep their cells, which are blocked for
@@ -161,28 +161,6 @@ def reachable_lanes(
             within = found[name].intersection(range(first, last + 1))
             found[name] = within if lane in within else frozenset(range(first, last + 1))
     return found
-
-
-def assign_nearby(
-    cells: Mapping[Name, Cell], eligible: Mapping[Name, Sequence[int]], targets: Sequence[Cell]
-) -> dict[Name, int]:
-    """Return the index of a target for each vehicle, minimizing the sum of squared distances.
-
-    Args:
-        cells: current cell of each vehicle.
-        eligible: indices of the targets that each vehicle may have.
-        targets: the target cells.
-    """
-    columns, lanes = (max(values) for values in zip(*cells.values(), *targets, strict=True))
-    # More than all permitted distances together.
-    penalty = 1 + len(cells) * (columns + lanes) ** 2
-    costs = np.full((len(cells), len(targets)), penalty)
-    for row, (name, (column, lane)) in enumerate(cells.items()):
-        for number in eligible[name]:
-            distance = abs(column - targets[number][0]) + abs(lane - targets[number][1])
-            costs[row, number] = distance**2
-    found = linear_sum_assignment(costs)[1]
-    return {name: int(number) for name, number in zip(cells, found, strict=True)}
 
 
 def _combinations(choices: Sequence[Sequence[tuple[float, list[Cell]]]]) -> Iterator[list[Cell]]:

@@ -16,7 +16,7 @@ from typing import ClassVar
 import attrs
 from attrs import frozen
 
-from laneweave.coordinator.planning.plug_ins.registry import checked_solver
+from laneweave.coordinator.planning.plug_ins.registry import check_solver
 from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.coordinator.planning.response import PlanFunction, PlanResponse
 from laneweave.coordinator.service.cancellation import cancelled_id
@@ -49,7 +49,6 @@ from laneweave.protocol.runtime.queries import (
     format_of,
 )
 from laneweave.protocol.scenario.deployment_fields import Service
-from laneweave.protocol.scenario.formation_table import DEFAULT_SOLVER
 
 AHEAD_BELOW_S = 0.02
 """Mean time of plans below which each worker has one job ahead, so that it is not idle between two.
@@ -98,7 +97,7 @@ class PlanningService:
         settings: Service,
         workers: int,
         plan: PlanFunction,
-        solver: str = DEFAULT_SOLVER,
+        solver: str | None = None,
     ) -> None:
         """Make a service without requests.
 
@@ -107,7 +106,7 @@ class PlanningService:
             settings: limits.
             workers: number of requests to answer concurrently.
             plan: answers a request, in a worker process.
-            solver: solver for requests that name none.
+            solver: solver for requests that name none; None: the planner chooses.
         """
         self._name = name
         self._solver = solver
@@ -221,7 +220,7 @@ class PlanningService:
             )
         request = PlanRequest.from_dict(form.read(payload))
         if request.solver is not None:
-            checked_solver(request.solver)
+            check_solver(request.solver)
         if request.deadline_s > self._settings.max_deadline_s:
             allowed = f"at most {self._settings.max_deadline_s:g} at this service"
             raise BadInputError("deadline_s", request.deadline_s, allowed)

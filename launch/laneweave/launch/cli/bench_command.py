@@ -66,13 +66,13 @@ def bench(
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
     """Benchmark runs with 30, 60 and 90 vehicles, plans for 6 to 36 vehicles, or the tracker."""
-    from laneweave.coordinator.planning.plug_ins.registry import checked_solver
+    from laneweave.coordinator.planning.plug_ins.registry import check_solver
     from laneweave.launch.bench.planner import FAMILIES, bench_planner, planner_table
     from laneweave.launch.bench.runtime import bench_runtime, machine, runtime_table
     from laneweave.launch.bench.tracker import bench_tracker, tracker_table
 
     if what is Benchmark.planner:
-        checked_solver(solver, "--solver")
+        check_solver(solver, "--solver")
         sizes, chosen = _parse_sizes(vehicles, "6,9,12,18,24,36"), families.split(",")
         for family in chosen:
             if family not in FAMILIES:

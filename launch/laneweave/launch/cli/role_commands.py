@@ -97,7 +97,7 @@ def coordinator(
     log_level: Level = None,
 ) -> None:
     """Run a coordinator, which also answers plan requests."""
-    from laneweave.coordinator.planning.plug_ins.registry import checked_solver
+    from laneweave.coordinator.planning.plug_ins.registry import check_solver
     from laneweave.coordinator.process import run_coordinator
     from laneweave.protocol.names import NAME_PATTERN, NAME_RULE
 
@@ -108,7 +108,7 @@ def coordinator(
     settings = load_deployment(
         config, endpoint, observation__metrics=metrics, formation__solver=solver
     )
-    checked_solver(settings.formation.solver, "formation.solver")
+    check_solver(settings.formation.solver, "formation.solver")
     with _as_role("coordinator", name, settings, log_format, log_level) as observe:
         run_coordinator(settings, name, observe=observe, fork_workers=True, grace_s=drain)
 

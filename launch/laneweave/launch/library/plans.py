@@ -11,7 +11,7 @@ import attrs
 
 from laneweave.coordinator.planning import solve
 from laneweave.coordinator.planning.kernels import BRANCHING
-from laneweave.coordinator.planning.plug_ins.registry import checked_solver
+from laneweave.coordinator.planning.plug_ins.registry import check_solver
 from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.coordinator.planning.response import PlanResponse
 from laneweave.launch.run.logs import log_by_default
@@ -44,7 +44,7 @@ def plan(
     Args:
         request: a request, its JSON form as a mapping, or the path of a JSON file.
         solver: `tappa`, `branching`, or the name of a plug-in (`laneweave.planners`); None: that of
-            the request, by default `tappa`.
+            the request; if it names none, the planner chooses.
         deadline_s: planning time [s]; None: that of the request, by default 4 s.
 
     Raises:
@@ -99,7 +99,7 @@ def _solver_problems(data: Mapping[str, Any]) -> Iterator[BadInputError]:
     solver = data.get("solver")
     if isinstance(solver, str) and NAME_PATTERN.fullmatch(solver):
         try:
-            checked_solver(solver)
+            check_solver(solver)
         except BadInputError as error:
             yield error
 

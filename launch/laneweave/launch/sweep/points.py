@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from attrs import evolve, frozen
 
 from laneweave.agents.driving.trajectory import check_moves
-from laneweave.coordinator.planning.plug_ins.registry import checked_solver
+from laneweave.coordinator.planning.plug_ins.registry import check_solver
 from laneweave.launch.run_methods import (
     FORMATION,
     REFERENCE_METHODS,
@@ -124,7 +124,7 @@ def _check_plug_ins(scenario: Scenario, method: str) -> None:
     if scenario.sumo.config and method != FORMATION:
         raise BadInputError("--methods", method, f"{FORMATION}, with a SUMO simulation")
     if method == FORMATION:
-        checked_solver(scenario.formation.solver, "formation.solver")
+        check_solver(scenario.formation.solver, "formation.solver")
     elif not REFERENCE_METHODS.is_built_in(method):
         reference_method(method, "--methods").check(scenario)
 

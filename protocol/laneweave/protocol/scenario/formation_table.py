@@ -9,6 +9,7 @@ from typing import Any, Final
 
 import attrs
 from attrs import field, frozen
+from attrs.validators import optional
 
 from laneweave.protocol.errors import unknown_name
 from laneweave.protocol.field_validators import key_part, one_of, within, within_or_none
@@ -47,13 +48,18 @@ READY_LATE_S = 1.2
 SLACK_S = 0.2
 """Part of T_F without motion if `formation.move_s` is not set."""
 PAPERS_FORMATIONS: Mapping[str, object] = MappingProxyType(
-    {"entry": "interlaced", "close": "columns", "cycle_s": 4.0}
+    {
+        "entry": "interlaced",
+        "close": "columns",
+        "cycle_s": 4.0,
+        "targets": "parallel",
+        "solver": "tappa",
+    }
 )
 """Values of the table `formation` that the former `operation = "paper"` selects."""
 SOLVERS: Final = ("tappa", "branching")
 """Built-in solvers. `tappa`: the paper's algorithm. `branching`: branch and bound, for large
 formations. Coordinators may have others (`laneweave.coordinator.planning.plug_ins`)."""
-DEFAULT_SOLVER: Final = "tappa"
 
 
 def solver_of_event(kind: str, data: Mapping[str, Any]) -> str | None:
@@ -127,6 +133,9 @@ class FormationSettings:
     structures: tuple[DrivingStructure, ...] = ()
     """Structures that formations take on in turn before they sort in S3; empty: vehicles stay in
     the cells in which they entered."""
+    targets: str = field(default="lane", validator=one_of("lane", "parallel"))
+    """Where vehicles with one goal lane sort into. `lane`: any cells of the lane. `parallel`:
+    neighbouring cells of it, as in the paper."""
     mode: int = field(default=1, validator=one_of(1, 2))
     """Relative motion mode."""
     conflicts: tuple[str, ...] = field(default=(), validator=_conflict_kinds)
@@ -135,9 +144,9 @@ class FormationSettings:
     """l_s of the formation relative distance."""
     weight_oblique: int | None = field(default=None, validator=one_of(None, 0, 1, 2))
     """l_o of the formation relative distance; None: the number of steps of an oblique edge."""
-    solver: str = field(default=DEFAULT_SOLVER, validator=key_part)
+    solver: str | None = field(default=None, validator=optional(key_part))
     """Solver of formations, and of service requests that do not name one: built in, or a plug-in
-    that the coordinators have installed."""
+    that the coordinators have installed. None: the planner chooses (`planning.solve`)."""
     planning_deadline_s: float | None = field(default=None, validator=within_or_none(0.01, 3600.0))
     """Maximum planning time; None: the time until the first move could begin, 1 to 15 s. On most
     machines `max_nodes` is reached first."""
@@ -169,8 +178,8 @@ class FormationSettings:
         return self._has("sort_in_s2", True)
 
     @property
-    def planner(self) -> str:
-        """Name of the planner of the operation."""
+    def planner(self) -> str | None:
+        """Name of the planner of the operation; None: the planner chooses a solver."""
         return self.traits.planner or self.solver
 
     @property

@@ -76,6 +76,7 @@ OPERATIONS: Mapping[str, OperationTraits] = MappingProxyType(
                     "formation.max_joined",
                     "formation.join",
                     "formation.structures",
+                    "formation.targets",
                     "formation.solver",
                     "formation.weight_straight",
                     "formation.weight_oblique",

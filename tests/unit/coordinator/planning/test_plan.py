@@ -3,6 +3,7 @@
 import functools
 import itertools
 import os
+import random
 import subprocess
 import sys
 from pathlib import Path
@@ -24,6 +25,8 @@ from laneweave.launch.bench.request_families import block_request, formation_req
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario.formation_table import CONFLICT_KINDS, SOLVERS
+from oracles.milp_oracle import fewest_steps
+from oracles.path_rules import Problem
 from support.examples import examples
 from support.planning_oracles import CountingClock, cheapest_plan, faults, requests
 
@@ -58,6 +61,45 @@ def test_cost_is_optimal_or_infeasibility_is_proven(request: PlanRequest) -> Non
 def test_vehicles_drive_only_their_moves(request: PlanRequest, solver: str) -> None:
     """Both solvers find the optimum, alone, if vehicles cannot drive all moves."""
     assert faults(request.to_dict(), cheapest_plan(request), solver) == []
+
+
+@pytest.mark.slow
+@examples(60)
+@given(requests(), st.integers(0, 6), st.sampled_from(SOLVERS))
+def test_plans_have_no_more_steps_than_are_permitted(
+    request: PlanRequest, steps: int, solver: str
+) -> None:
+    limited = attrs.evolve(request, max_steps=steps)
+    assert faults(limited.to_dict(), cheapest_plan(limited), solver) == []
+
+
+def crowded(seed: int, max_steps: int) -> PlanRequest:
+    """Return a request for six vehicles in nine cells; two lanes become full."""
+    cells = [(column, lane) for column in range(3) for lane in range(3)]
+    starts = random.Random(seed).sample(cells, 6)  # noqa: S311
+    vehicles = tuple(
+        VehicleRequest(f"v{number}", cell, lane=2 * (number % 2)) for number, cell in enumerate(starts)
+    )
+    kinds = ("node", "edge", "special-1", "closing")
+    return PlanRequest(
+        Grid(3, 3), 1, kinds, vehicles, tuple(cells), deadline_s=60.0, max_steps=max_steps
+    )
+
+
+def test_a_crowded_formation_needs_fewer_steps_at_a_higher_cost() -> None:
+    """The cheapest plan takes more steps than the fewest, which a breadth-first search finds."""
+    fewer = 0
+    for seed in range(12):
+        cheapest = plan(crowded(seed, 100))
+        assert cheapest.cost is not None
+        fewest = fewest_steps(Problem.of(crowded(seed, 100).to_dict()))
+        assert fewest is not None
+        quickest = plan(crowded(seed, fewest))
+        assert (quickest.status, quickest.steps) == ("optimal", fewest)
+        assert (quickest.cost or 0) >= cheapest.cost
+        assert plan(crowded(seed, fewest - 1)).status == "infeasible"
+        fewer += (quickest.cost or 0) > cheapest.cost
+    assert fewer
 
 
 def test_a_vehicle_that_only_changes_lanes_stays_in_its_column() -> None:

@@ -1,4 +1,4 @@
-"""The choice of the solver: by name, by default, and the fallback from TAPPA to branching."""
+"""The choice of the solver: by name, by default, and the fallback to the other one."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ HARD = formation_request(1, vehicles=14, deadline_s=3600.0)
 NODES = 60
 
 
-def test_tappa_plans_unless_another_solver_is_named() -> None:
-    assert plan(EASY).solver == "tappa"
+def test_branching_plans_unless_another_solver_is_named() -> None:
+    assert plan(EASY).solver == "branching"
     assert plan(attrs.evolve(EASY, solver="branching")).solver == "branching"
     assert plan(attrs.evolve(EASY, solver="branching"), solver="tappa").solver == "tappa"
 
@@ -52,7 +52,7 @@ def test_a_request_keeps_its_solver_in_json(solver: str | None) -> None:
 
 def test_responses_without_a_solver_are_read() -> None:
     written = plan(EASY).to_dict()
-    assert written.pop("solver") == "tappa"
+    assert written.pop("solver") == "branching"
     assert "fallback" not in written
     old = PlanResponse.from_dict(written)
     assert (old.solver, old.fallback) == (None, False)
@@ -65,7 +65,7 @@ def test_responses_without_a_solver_are_read() -> None:
 def test_branching_continues_when_tappa_has_spent_its_nodes() -> None:
     alone = plan(HARD, max_nodes=NODES, solver="tappa", fallback=False)
     assert (alone.status, alone.solver, alone.fallback) == ("timeout", "tappa", False)
-    response = plan(HARD, max_nodes=NODES)
+    response = plan(HARD, max_nodes=NODES, solver="tappa")
     best = plan(HARD, solver="branching")
     assert (response.solver, response.fallback) == ("branching", True)
     assert (response.status, response.cost) == ("optimal", best.cost)
@@ -75,7 +75,9 @@ def test_branching_continues_when_tappa_has_spent_its_nodes() -> None:
 
 
 def test_a_fallback_by_nodes_is_repeatable() -> None:
-    one, other = (attrs.evolve(plan(HARD, max_nodes=NODES), solve_ms=0.0) for _ in range(2))
+    one, other = (
+        attrs.evolve(plan(HARD, max_nodes=NODES, solver="tappa"), solve_ms=0.0) for _ in range(2)
+    )
     assert one == other
 
 
@@ -84,7 +86,7 @@ def test_the_cheaper_path_set_and_the_higher_bound_are_kept(seed: int, nodes: in
     """TAPPA has a path set without proof; branching finds a cheaper one or proves its cost."""
     request = formation_request(seed, vehicles=8, deadline_s=3600.0)
     alone = plan(request, max_nodes=math.ceil(TAPPA_SHARE * nodes), solver="tappa", fallback=False)
-    both = plan(request, max_nodes=nodes)
+    both = plan(request, max_nodes=nodes, solver="tappa")
     assert (both.solver, both.fallback) == ("branching", True)
     assert alone.cost is not None
     assert both.cost is not None
@@ -93,7 +95,8 @@ def test_the_cheaper_path_set_and_the_higher_bound_are_kept(seed: int, nodes: in
 
 
 def test_branching_continues_when_tappa_has_spent_its_time() -> None:
-    response = plan(attrs.evolve(HARD, deadline_s=30.0), clock=CountingClock(0.01))
+    hurried = attrs.evolve(HARD, deadline_s=30.0, solver="tappa")
+    response = plan(hurried, clock=CountingClock(0.01))
     assert (response.solver, response.fallback) == ("branching", True)
     assert response.solve_ms <= 30.1e3
 
@@ -101,5 +104,6 @@ def test_branching_continues_when_tappa_has_spent_its_time() -> None:
 def test_tappa_spends_everything_where_branching_cannot_plan() -> None:
     """Where vehicles may share a cell, branching cannot plan at all."""
     request = attrs.evolve(EASY, conflicts=("edge",))
-    asked = [plan(request, solver=solver) for solver in SOLVERS]
-    assert [(one.solver, one.fallback) for one in asked] == [("tappa", False), ("tappa", True)]
+    asked = [plan(request, solver=solver) for solver in (None, *SOLVERS)]
+    fallbacks = [False, False, True]
+    assert [(one.solver, one.fallback) for one in asked] == [("tappa", each) for each in fallbacks]

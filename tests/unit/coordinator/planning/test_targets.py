@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 
 from laneweave.coordinator.planning.targets import (
     Targets,
-    assign_nearby,
     placements,
     reachable_lanes,
 )
@@ -218,8 +217,3 @@ def test_as_many_as_possible_reach_their_goals(
     assert max(map(satisfied, allowed)) == max(map(satisfied, possible))
     reaching = sum(found[name] <= goals[name] for name in cells)
     assert reaching >= max(map(satisfied, possible))
-
-
-def test_a_target_that_is_not_eligible_is_not_assigned() -> None:
-    targets: list[Cell] = [(0, 0), (0, 1)]
-    assert assign_nearby({A: (5, 5)}, {A: [0]}, targets) == {A: 0}

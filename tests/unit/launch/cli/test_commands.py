@@ -80,7 +80,7 @@ def test_the_help_of_a_command_imports_no_other() -> None:
 
 
 def test_a_plan_imports_what_it_needs() -> None:
-    modules = imported_by("plan", CASE)
+    modules = imported_by("plan", CASE, "--solver", "tappa")
 
     assert commands_of(modules) == {"plan_command"}
     assert not modules & SLOW

@@ -17,7 +17,7 @@ CASE_STUDY = Path(__file__).parents[4] / "docs" / "examples" / "case-study.json"
 @for_each(
     ("written", "option", "planned"),
     [
-        (None, None, "tappa"),
+        (None, None, "branching"),
         ("branching", None, "branching"),
         (None, "branching", "branching"),
         ("branching", "tappa", "tappa"),

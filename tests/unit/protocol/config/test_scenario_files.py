@@ -65,7 +65,12 @@ def test_paper_stands_for_interlaced_blocks_of_columns_and_slots_of_four_seconds
     tmp_path: Path,
 ) -> None:
     meant = FormationSettings(
-        operation="formations", entry="interlaced", close="columns", cycle_s=4.0
+        operation="formations",
+        entry="interlaced",
+        close="columns",
+        cycle_s=4.0,
+        targets="parallel",
+        solver="tappa",
     )
     assert parse_scenario({"formation": {"operation": "paper"}}).formation == meant
     assert load_scenario(None, formation__operation="paper").formation == meant

@@ -42,6 +42,7 @@ SINGLE_ROLE_FIELDS = {
     "formation.max_joined": "coordinator",
     "formation.join": "coordinator",
     "formation.structures": "coordinator",
+    "formation.targets": "coordinator",
     "formation.conflicts": "coordinator; vehicles check the footprints of a plan themselves",
     "formation.reward_drift": "coordinator",
     "road.events": "bridge, which tells all others",

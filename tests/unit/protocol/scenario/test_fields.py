@@ -80,6 +80,8 @@ def test_the_file_of_the_paper_holds_the_defaults_but_for_its_formations() -> No
         close="columns",
         cycle_s=4.0,
         move_s=3.8,
+        targets="parallel",
+        solver="tappa",
         conflicts=explicit,
     )
     assert load_scenario(FOLDER / "paper.toml") == attrs.evolve(default, formation=formation)
@@ -151,6 +153,8 @@ def test_every_wrong_type_of_every_field_is_refused_by_name(field: str, default:
         wrongs = (1, True, None, "node", {}, {"a": 1}, [True], [[]], [None], [math.nan], [{}])
     elif isinstance(default, TABLE_BY_NAME):
         wrongs = (1, True, None, [], "x", 1.5, {"a": 1}, {"a": []}, {"a": "x"}, {"a": [1]})
+    elif field == "formation.solver":
+        wrongs = (1, True, [], {}, 1.5)
     elif field in (
         "formation.cycle_s",
         "sumo.begin_s",

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from laneweave.coordinator.planning.conflict_kinds import ConflictModel
 from laneweave.coordinator.planning.exact.cliques import Clique, clique_patterns
-from laneweave.coordinator.planning.exact.multipliers_kernel import min_steps
+from laneweave.coordinator.planning.exact.multipliers_kernel import cliques_of_moves, min_steps
 from laneweave.coordinator.planning.grid import Grid
 from laneweave.protocol.lattice import Cell, Mode, displacements
 
@@ -102,23 +102,14 @@ def _cliques(
     grid: Grid, patterns: tuple[Clique, ...], displacement_count: int, valid: Bools
 ) -> tuple[Ints, int]:
     """Return each move's cliques of at least two moves on the grid, and the number of cliques."""
-    members: dict[tuple[int, int, int], list[tuple[int, int]]] = {}
-    for number, pattern in enumerate(patterns):
-        for c, across, d in pattern:
-            for cell in np.flatnonzero(valid[d]).tolist():
-                column, lane = divmod(cell, grid.lanes)
-                members.setdefault((number, column - c, lane - across), []).append((d, cell))
-    numbered = sorted(key for key, moves in members.items() if len(moves) > 1)
-    of_move: dict[tuple[int, int], list[int]] = {}
-    for index, key in enumerate(numbered):
-        for move in members[key]:
-            of_move.setdefault(move, []).append(index)
-    max_cliques = max(map(len, of_move.values()), default=1)
-    shape = displacement_count, grid.columns * grid.lanes, max_cliques
-    clique = np.full(shape, -1, dtype=np.int64)
-    for (d, cell), indices in of_move.items():
-        clique[d, cell, : len(indices)] = indices
-    return clique, len(numbered)
+    # In descending order of offsets, so that the indices of a move's cliques ascend.
+    members = [
+        (number, *member)
+        for number, pattern in enumerate(patterns)
+        for member in sorted(pattern, reverse=True)
+    ]
+    valid = valid.reshape(displacement_count, grid.columns, grid.lanes)
+    return cliques_of_moves(np.array(members, dtype=np.int64).reshape(-1, 4), valid)
 
 
 def teams(

@@ -78,6 +78,13 @@ _JOINT_MOVES = 200_000
 _CALL_WORK = 8
 _BYTES_PER_S = 1_000_000_000
 """Approximate speed at which arrays are filled."""
+_MAX_MOVES, _S_PER_MOVE = 5_000_000, 5e-8
+"""Maximum number of moves of all teams in all steps, and the time for each until the first bound is
+known. Larger problems are mostly empty: TAPPA plans them."""
+_MAX_SHARE = 0.5
+"""Maximum share of the remaining time that this may take."""
+_ITERATIONS_PER_NODE = 20
+"""Number of iterations that a node takes, before the first one has been timed."""
 
 
 def call_kernels() -> None:
@@ -94,7 +101,9 @@ def call_kernels() -> None:
 
 
 class Branching(Search):
-    """Branch and bound; aborts if it is stuck (`branching_kernel.STUCK`) or out of memory."""
+    """Branch and bound; aborts if it is stuck (`branching_kernel.STUCK`), or out of memory, or if
+    the problem is too large.
+    """
 
     def __init__(self, problem: Problem, choices: Sequence[frozenset[int]], budget: Budget) -> None:
         """Prepare the search."""
@@ -148,10 +157,11 @@ class Branching(Search):
                 break
             if number == _BATCH and len(self._choices) >= _MANY_VEHICLES:
                 self.negotiate(root, _FIRST_WORK, stop_at_first=True)
+        self._s_per_node = _ITERATIONS_PER_NODE * self._s_per_iteration
         nodes = root.stack(_FIRST_STACK)
         while not self.finished and not self.aborted:
-            if math.isinf(self.lower_bound):
-                self.finished = True
+            if math.isinf(self.lower_bound) or self.lower_bound > self._problem.max_cost:
+                self.lower_bound, self.finished = math.inf, True
             elif self._is_proven():
                 nodes = self._break_ties(root, nodes)
                 self.finished = True
@@ -178,7 +188,7 @@ class Branching(Search):
         self.lower_bound = max(self.lower_bound, root.min_cost)
 
     def _fits(self, steps: int, nodes: int) -> bool:
-        """Return whether the arrays for a number of steps and nodes fit within the memory limit.
+        """Return whether the arrays for a number of steps and nodes fit within the limits.
 
         Raises:
             BudgetSpentError: they fit, but there is no time left to fill them.
@@ -188,14 +198,19 @@ class Branching(Search):
         moves, masses = groups * displacements * cells, groups + self._arrays.residue_count
         size = 8 * cells * len(self._teams.pair_cell) + 33 * moves + 8 * cliques * (masses + 3)
         size = int(steps * (size + nodes * (moves + 8 * cliques)))
-        if size >= self._budget.max_bytes:
+        setup_s = _S_PER_MOVE * steps * moves
+        if (
+            size >= self._budget.max_bytes
+            or steps * moves > _MAX_MOVES
+            or setup_s > _MAX_SHARE * self._budget.left_s
+        ):
             return False
         self._budget.check_time(size / _BYTES_PER_S)
         return True
 
     def relaxation(self, steps: int) -> Relaxation:
         """Return the relaxed problem with multipliers of 0."""
-        return Relaxation(self._arrays, self._teams, steps)
+        return Relaxation(self._arrays, self._teams, steps, self._problem.max_steps)
 
     def _longest_path(self) -> int:
         """Return the length of the longest path when targets are assigned at minimum cost."""
@@ -368,9 +383,12 @@ class Branching(Search):
             )
 
     def _keep_if_better(self, solution: Solution) -> None:
-        """Keep a path set that is cheaper than the best so far, or as cheap with fewer moves."""
+        """Keep a path set that is cheaper than the best so far, or as cheap with fewer moves.
+
+        The searches that `_run_heuristics` calls do not limit the number of steps.
+        """
         value = self._value(solution)
-        if value < self._best_value:
+        if value < self._best_value and not self._problem.is_too_long(solution):
             self.best, self._best_value = solution, value
 
     def _value(self, solution: Solution) -> float:

@@ -137,8 +137,18 @@ class Relaxation:
     multipliers: (T, R); T is the number of steps in which cliques have multipliers.
     """
 
-    def __init__(self, arrays: MoveArrays, teams: Teams, steps: int) -> None:
-        """Start with multipliers of 0 in `steps` steps."""
+    def __init__(
+        self, arrays: MoveArrays, teams: Teams, steps: int, max_steps: int | None = None
+    ) -> None:
+        """Start with multipliers of 0 in `steps` steps.
+
+        Args:
+            arrays: the moves.
+            teams: the vehicles and targets.
+            steps: number of steps with multipliers.
+            max_steps: number of steps after which all vehicles have arrived; None: any number.
+        """
+        self._max_steps = max_steps
         self.arrays = arrays
         self.teams = teams
         self.state = np.zeros(BEST + 1)
@@ -151,6 +161,8 @@ class Relaxation:
         shape = len(self.teams.pair), len(multipliers), *self.arrays.valid.shape
         self.allowed = np.empty(shape, dtype=np.bool_)
         self.allowed[:] = self.teams.drives[:, None]
+        if self._max_steps is not None:
+            self.allowed[:, self._max_steps :] = False
         self.earliest = np.zeros(len(self.teams.pair_cell), dtype=np.int64)
         # Forbid moves from cells that no vehicle can reach in time.
         self._begin()

@@ -33,6 +33,47 @@ _FADING = 0.92
 
 
 @njit(cache=True, nogil=True)
+def cliques_of_moves(members, valid):
+    """Return each move's cliques of at least two moves (D, X, M), and the number of cliques.
+
+    members: (., 4) pattern, columns and lanes from the anchor, and displacement of each member of a
+    pattern, in ascending order of patterns; valid: (D, columns, lanes) moves of the grid.
+    """
+    displacements, columns, lanes = valid.shape
+    reach, across = 0, 0
+    for i in range(len(members)):
+        reach, across = max(reach, abs(members[i, 1])), max(across, abs(members[i, 2]))
+    patterns = 1 + members[-1, 0] if len(members) else 0
+    index = np.zeros((patterns, columns + 2 * reach, lanes + 2 * across), np.int64)
+    of_displacement = np.zeros(displacements, np.int64)
+    for i in range(len(members)):
+        pattern, c, side, d = members[i]
+        of_displacement[d] += 1
+        for column in range(columns):
+            for lane in range(lanes):
+                if valid[d, column, lane]:
+                    index[pattern, column - c + reach, lane - side + across] += 1
+    count = 0
+    flat = index.ravel()
+    for anchor in range(len(flat)):  # from sizes to indices
+        large = flat[anchor] > 1
+        flat[anchor] = count if large else -1
+        count += large
+    found = np.full((displacements, columns * lanes, max(1, of_displacement.max())), -1)
+    used = np.zeros((displacements, columns * lanes), np.int64)
+    for i in range(len(members)):
+        pattern, c, side, d = members[i]
+        for column in range(columns):
+            for lane in range(lanes):
+                clique = index[pattern, column - c + reach, lane - side + across]
+                if valid[d, column, lane] and clique >= 0:
+                    cell = column * lanes + lane
+                    found[d, cell, used[d, cell]] = clique
+                    used[d, cell] += 1
+    return found[:, :, : max(1, used.max())].copy(), count
+
+
+@njit(cache=True, nogil=True)
 def min_steps(valid, step, targets):
     """Return the minimum steps (X, P) from every cell to each target, ignoring other vehicles."""
     displacements, cells = valid.shape

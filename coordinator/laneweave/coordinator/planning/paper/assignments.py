@@ -102,7 +102,7 @@ def matrices(
 
     Blocked cells, or moves that a vehicle cannot drive, may make a path longer than the formation
     relative distance, or impossible. Both only improve the lower bound: C takes the longer
-    distance, and P drops unreachable targets.
+    distance, and P drops targets that cannot be reached, or not within the permitted steps.
     """
     starts = [vehicle.cell for vehicle in request.vehicles]
     costs = cost_matrix(starts, request.targets, weights)
@@ -116,6 +116,8 @@ def matrices(
                     costs[i, j] = max(costs[i, j], distances[target])
                 else:
                     allowed[i, j] = np.False_
+    if problem.max_steps is not None:
+        allowed &= costs <= problem.max_steps
     return costs, allowed
 
 

@@ -75,10 +75,11 @@ PLANNERS: Final = PlugIns(
 """All solvers; built-in ones are functions that return a `Search` for a request."""
 
 
-def checked_solver(name: str, field: str = "solver") -> str:
-    """Return the name of a solver that is built in, or a plug-in that is installed.
+def check_solver(name: str | None, field: str = "solver") -> None:
+    """Check that a solver is built in, or a plug-in that is installed; None: none is named.
 
     Raises:
         BadInputError: no solver has this name.
     """
-    return PLANNERS.checked(name, field)
+    if name is not None:
+        PLANNERS.checked(name, field)

@@ -52,7 +52,7 @@ def planner(install: Install, body: str) -> None:
 
 def replaced(response: PlanResponse) -> bool:
     """Return whether built-in solvers made the plan, which is optimal for this request."""
-    return (response.solver, response.fallback, response.status) == ("tappa", True, "optimal")
+    return (response.solver, response.fallback, response.status) == ("branching", True, "optimal")
 
 
 def test_built_in_solvers_are_in_the_registry() -> None:
@@ -161,7 +161,7 @@ class Own:
         return {OPTIMAL} if self.calls == 2 else None
 """
     install("mine", {"own": "Own"}, source)
-    assert [plan(REQUEST, solver="own").solver for _ in range(2)] == ["tappa", "own"]
+    assert [plan(REQUEST, solver="own").solver for _ in range(2)] == ["branching", "own"]
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,197 @@
+"""Requests that cost planners the most: is the answer in time, and how much memory does it take?
+
+    python benchmarks/hostile_requests.py [--solver NAME ...] [--instances N] [--seed N] [--json FILE]
+
+Random boards of 2 to 60 vehicles: crowded, divided by obstacles, nearly full, with hundreds of
+columns, one alcove beside a single lane; both motion modes, all conflict kinds, targets of one's
+own or shared, deadlines of 0.2 to 4 s. Each request is planned in a process of its own, with
+compiled code loaded. Time is wall time from the request to the response beyond the deadline; memory
+is the peak of the process.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import random
+import resource
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from rich.progress import track
+
+from laneweave.coordinator.planning.grid import Grid
+from laneweave.coordinator.planning.kernels import BRANCHING
+from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
+from laneweave.coordinator.planning.solve import plan
+from laneweave.protocol.lattice import Cell
+
+OUT = Path(__file__).resolve().parents[1] / "docs" / "evidence" / "hostile-requests.json"
+DEADLINES_S = (0.2, 0.5, 1.0, 2.0, 4.0)
+CONFLICTS = {
+    1: (("node", "edge"), ("node", "edge", "special-1"), ("node", "edge", "special-1", "closing"), ("edge",)),
+    2: (("geometric",), ("node", "edge"), ("geometric", "closing")),
+}  # fmt: skip
+MAX_VEHICLES, LIMIT_S = 60, 60.0
+
+
+def crowded(rng: random.Random) -> tuple[Grid, int]:
+    """Return a board with few empty cells, and the number of its vehicles."""
+    grid = Grid(rng.randint(2, 12), rng.randint(2, 8))
+    cells = grid.columns * grid.lanes
+    return grid, min(MAX_VEHICLES, cells - rng.randint(1, max(1, cells // 4)))
+
+
+def obstacles(rng: random.Random) -> tuple[Grid, int]:
+    """Return a board with obstacles, which may divide it."""
+    columns, lanes = rng.randint(3, 20), rng.randint(2, 8)
+    cells = [(column, lane) for column in range(columns) for lane in range(lanes)]
+    blocked = rng.sample(cells, int(len(cells) * rng.uniform(0.1, 0.5)))
+    free = len(cells) - len(blocked)
+    return Grid(columns, lanes, tuple(sorted(blocked))), rng.randint(2, min(MAX_VEHICLES, free))
+
+
+def long_board(rng: random.Random) -> tuple[Grid, int]:
+    """Return a board with hundreds of columns."""
+    return Grid(rng.randint(100, 1000), rng.randint(1, 16)), rng.randint(2, MAX_VEHICLES)
+
+
+def alcove(rng: random.Random) -> tuple[Grid, int]:
+    """Return a single lane with one alcove beside it."""
+    columns = rng.randint(3, 12)
+    place = rng.randrange(columns)
+    blocked = tuple((column, 1) for column in range(columns) if column != place)
+    return Grid(columns, 2, blocked), rng.randint(2, columns - 1)
+
+
+def board(rng: random.Random) -> tuple[Grid, int]:
+    """Return a board of any size and any number of vehicles."""
+    grid = Grid(rng.randint(4, 40), rng.randint(2, 8))
+    return grid, rng.randint(2, min(MAX_VEHICLES, grid.columns * grid.lanes - 1))
+
+
+FAMILIES: dict[str, Callable[[random.Random], tuple[Grid, int]]] = {
+    "crowded": crowded,
+    "obstacles": obstacles,
+    "long": long_board,
+    "alcove": alcove,
+    "board": board,
+}
+
+
+def hostile_request(seed: int) -> tuple[str, PlanRequest]:
+    """Return the family and the request of a seed."""
+    rng = random.Random(seed)  # noqa: S311
+    family = list(FAMILIES)[seed % len(FAMILIES)]
+    grid, vehicles = FAMILIES[family](rng)
+    blocked = {*grid.blocked}
+    free: list[Cell] = [
+        (column, lane)
+        for column in range(grid.columns)
+        for lane in range(grid.lanes)
+        if (column, lane) not in blocked
+    ]
+    starts = rng.sample(free, vehicles)
+    targets = rng.sample(free, min(len(free), 400, vehicles + rng.choice((0, 0, vehicles))))
+    kind = rng.choice(("own", "any", "half"))
+    half = len(targets) // 2
+    eligible = {
+        "own": [(number,) for number in range(vehicles)],
+        "any": [None] * vehicles,
+        "half": [
+            tuple(range(half) if number < half else range(half, len(targets)))
+            for number in range(vehicles)
+        ],
+    }[kind]
+    mode = rng.choice((1, 2))
+    return family, PlanRequest(
+        grid,
+        1 if mode == 1 else 2,
+        rng.choice(CONFLICTS[mode]),
+        tuple(
+            VehicleRequest(f"v{number}", start, eligible=each)
+            for number, (start, each) in enumerate(zip(starts, eligible, strict=True))
+        ),
+        tuple(targets),
+        rng.choice(DEADLINES_S),
+    )
+
+
+def answer(seed: int, solver: str | None, result: Any) -> None:
+    """Plan the request of a seed; put time, memory and status into a connection."""
+    family, request = hostile_request(seed)
+    began_s = time.monotonic()
+    response = plan(request, solver=solver)
+    late_s = time.monotonic() - began_s - request.deadline_s
+    peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6
+    result.send(
+        {
+            "seed": seed,
+            "family": family,
+            "vehicles": len(request.vehicles),
+            "deadline_s": request.deadline_s,
+            "status": response.status,
+            "cost": response.cost,
+            "lower_bound": response.lower_bound,
+            "solver": response.solver,
+            "late_s": round(late_s, 3),
+            "peak_mb": round(peak_mb),
+        }
+    )
+
+
+def answered(seed: int, solver: str | None) -> dict[str, Any]:
+    """Return what `answer` found out in a process of its own, or how this process ended."""
+    context = multiprocessing.get_context("fork")
+    receiver, sender = context.Pipe(duplex=False)
+    process = context.Process(target=answer, args=(seed, solver, sender))
+    process.start()
+    sender.close()
+    try:
+        found: dict[str, Any] = receiver.recv() if receiver.poll(LIMIT_S) else {"status": "hangs"}
+    except EOFError:
+        found = {"status": "error"}
+    process.kill()
+    process.join()
+    return {"seed": seed, **found}
+
+
+def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """Return what is late, how large processes grow, and what became of the requests."""
+    timed = [row for row in rows if "late_s" in row]
+    return {
+        "requests": len(rows),
+        "status": dict(Counter(row["status"] for row in rows)),
+        "late_s": max(max(row["late_s"] for row in timed), 0.0),
+        "peak_mb": max(row["peak_mb"] for row in timed),
+    }
+
+
+def main() -> int:
+    """Measure; return 1 if a process failed."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--solver", nargs="*", default=["default"], help="solvers; `default`: none")
+    parser.add_argument("--instances", type=int, default=200)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--json", type=Path, default=OUT)
+    options = parser.parse_args()
+    BRANCHING.load()
+    results = {}
+    seeds = range(options.seed, options.seed + options.instances)
+    for solver in options.solver:
+        name = None if solver == "default" else solver
+        rows = [answered(seed, name) for seed in track(seeds, solver, console=None)]
+        results[solver] = {**summary(rows), "rows": rows}
+        print(solver, summary(rows))  # noqa: T201
+    options.json.write_text(json.dumps(results, indent=1) + "\n")
+    failed = {"error", "hangs"}
+    return int(any(row["status"] in failed for one in results.values() for row in one["rows"]))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
