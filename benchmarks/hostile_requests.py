@@ -1,6 +1,7 @@
 """Requests that cost planners the most: is the answer in time, and how much memory does it take?
 
-    python benchmarks/hostile_requests.py [--solver NAME ...] [--instances N] [--seed N] [--json FILE]
+    python benchmarks/hostile_requests.py [--solver NAME ...] [--instances N] [--seed N]
+                                          [--json FILE]
 
 Random boards of 2 to 60 vehicles: crowded, divided by obstacles, nearly full, with hundreds of
 columns, one alcove beside a single lane; both motion modes, all conflict kinds, targets of one's
@@ -20,6 +21,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
@@ -30,11 +32,12 @@ from laneweave.coordinator.planning.kernels import BRANCHING
 from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
 from laneweave.coordinator.planning.solve import plan
 from laneweave.protocol.lattice import Cell
+from laneweave.protocol.scenario.formation_table import BASE_CONFLICTS
 
 OUT = Path(__file__).resolve().parents[1] / "docs" / "evidence" / "hostile-requests.json"
 DEADLINES_S = (0.2, 0.5, 1.0, 2.0, 4.0)
 CONFLICTS = {
-    1: (("node", "edge"), ("node", "edge", "special-1"), ("node", "edge", "special-1", "closing"), ("edge",)),
+    1: (("node", "edge"), BASE_CONFLICTS, (*BASE_CONFLICTS, "closing"), ("edge",)),
     2: (("geometric",), ("node", "edge"), ("geometric", "closing")),
 }  # fmt: skip
 MAX_VEHICLES, LIMIT_S = 60, 60.0
@@ -100,14 +103,14 @@ def hostile_request(seed: int) -> tuple[str, PlanRequest]:
     targets = rng.sample(free, min(len(free), 400, vehicles + rng.choice((0, 0, vehicles))))
     kind = rng.choice(("own", "any", "half"))
     half = len(targets) // 2
-    eligible = {
+    choices: dict[str, list[tuple[int, ...] | None]] = {
         "own": [(number,) for number in range(vehicles)],
         "any": [None] * vehicles,
         "half": [
             tuple(range(half) if number < half else range(half, len(targets)))
             for number in range(vehicles)
         ],
-    }[kind]
+    }
     mode = rng.choice((1, 2))
     return family, PlanRequest(
         grid,
@@ -115,14 +118,14 @@ def hostile_request(seed: int) -> tuple[str, PlanRequest]:
         rng.choice(CONFLICTS[mode]),
         tuple(
             VehicleRequest(f"v{number}", start, eligible=each)
-            for number, (start, each) in enumerate(zip(starts, eligible, strict=True))
+            for number, (start, each) in enumerate(zip(starts, choices[kind], strict=True))
         ),
         tuple(targets),
         rng.choice(DEADLINES_S),
     )
 
 
-def answer(seed: int, solver: str | None, result: Any) -> None:
+def answer(seed: int, solver: str | None, result: Connection) -> None:
     """Plan the request of a seed; put time, memory and status into a connection."""
     family, request = hostile_request(seed)
     began_s = time.monotonic()
@@ -167,7 +170,7 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
     return {
         "requests": len(rows),
         "status": dict(Counter(row["status"] for row in rows)),
-        "late_s": max(max(row["late_s"] for row in timed), 0.0),
+        "late_s": max(0.0, *(row["late_s"] for row in timed)),
         "peak_mb": max(row["peak_mb"] for row in timed),
     }
 

@@ -64,8 +64,8 @@ _FORMATIONS: Final = FormationSettings()
 def _default() -> LabelledMethod:
     """Return formation control with the default settings, regardless of the scenario."""
     names = (
-        "operation", "entry", "close", "cycle_s", "move_s", "max_vehicles", "max_columns", "targets",
-        "solver",
+        "operation", "entry", "close", "cycle_s", "move_s", "max_vehicles", "max_columns",
+        "targets", "solver",
     )  # fmt: skip
     return LabelledMethod(
         FORMATION, {f"formation.{name}": getattr(_FORMATIONS, name) for name in names}

@@ -39,8 +39,8 @@ from laneweave.protocol.wire.reasons import BLOCKED, CLOSED_LANE, NO_AGENT, NO_R
 MAX_PLACEMENTS = 6
 """Maximum number of parallel structures to try if the first one takes too many steps."""
 MAX_EXTRA_STEPS = 4
-"""If a plan into lanes takes too many steps, plans with at most as many as fit are sought, then with
-one more, and so on, up to this number of plans."""
+"""If a plan into lanes takes too many steps, plans with at most as many as fit are sought, then
+with one more, and so on, up to this number of plans."""
 MIN_DEADLINE_S = 0.05
 """Minimum deadline for one attempt."""
 

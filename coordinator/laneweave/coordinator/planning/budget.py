@@ -11,7 +11,7 @@ from typing import Final
 
 Clock = Callable[[], float]
 
-DEFAULT_MEMORY_MB: Final = 1500.0
+DEFAULT_MEMORY_MB: Final = 300.0
 
 _RELEASE_S_PER_NODE = 3e-6
 """Time to free a node's memory after the search."""

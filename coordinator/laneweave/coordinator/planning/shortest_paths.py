@@ -95,13 +95,21 @@ def conflicting_moves(
     return conflicting
 
 
-def choose_path(table: MoveTable, diagram: Diagram, conflicting: Sequence[int]) -> Path:
-    """Return the best path of a diagram, given the moves that conflict with other vehicles."""
+def choose_path(
+    table: MoveTable, diagram: Diagram, conflicting: Sequence[int], budget: Budget | None = None
+) -> Path:
+    """Return the best path of a diagram, given the moves that conflict with other vehicles.
+
+    Raises:
+        BudgetSpentError: the deadline has passed.
+    """
     fan, shifts = table.fan, table.shifts
     conflict_weight = diagram.cost + 1
     cost_to_go = {diagram.target: 0}
     choices: list[dict[int, int]] = []
     for step in range(diagram.cost - 1, -1, -1):
+        if budget is not None:
+            budget.check_time()
         layer = diagram.layers[step]
         bad = {*bits(layer & conflicting[step])}
         cost_before: dict[int, int] = {}

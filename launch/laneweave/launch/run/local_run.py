@@ -135,7 +135,7 @@ class LocalRun:
         """
         check_temporary_folder()
         check_network(self.scenario, self.demand.vehicles)
-        context = fork_server({self.scenario.formation.planner} & KERNELS.keys())
+        context = fork_server(KERNELS.keys() & {self.scenario.formation.planner})
         self.folder.mkdir(parents=True, exist_ok=True)
         with (
             stop_signals(self._request_stop),

@@ -138,7 +138,7 @@ class Service:
 
     workers: int = field(default=0, validator=within(0, 256))
     """Number of worker processes; 0: one less than the number of cores, but at least one."""
-    worker_memory_mb: float = field(default=1500.0, validator=within(50.0, 1_000_000.0))
+    worker_memory_mb: float = field(default=300.0, validator=within(50.0, 1_000_000.0))
     """Memory limit for the arrays of branch and bound in each worker. When a plan reaches it, the
     other solver completes the plan; without an optimality proof its status is `feasible`."""
     queue_limit: int = field(default=256, validator=within(1, 100_000))

@@ -76,9 +76,10 @@ def test_plans_have_no_more_steps_than_are_permitted(
 def crowded(seed: int, max_steps: int) -> PlanRequest:
     """Return a request for six vehicles in nine cells; two lanes become full."""
     cells = [(column, lane) for column in range(3) for lane in range(3)]
-    starts = random.Random(seed).sample(cells, 6)  # noqa: S311
+    starts = random.Random(seed).sample(cells, 6)
     vehicles = tuple(
-        VehicleRequest(f"v{number}", cell, lane=2 * (number % 2)) for number, cell in enumerate(starts)
+        VehicleRequest(f"v{number}", cell, lane=2 * (number % 2))
+        for number, cell in enumerate(starts)
     )
     kinds = ("node", "edge", "special-1", "closing")
     return PlanRequest(

@@ -109,7 +109,9 @@ def _cliques(
         for member in sorted(pattern, reverse=True)
     ]
     valid = valid.reshape(displacement_count, grid.columns, grid.lanes)
-    return cliques_of_moves(np.array(members, dtype=np.int64).reshape(-1, 4), valid)
+    listed = np.array(members, dtype=np.int64).reshape(-1, 4)
+    clique, count = cliques_of_moves(listed, valid)
+    return clique, int(count)
 
 
 def teams(

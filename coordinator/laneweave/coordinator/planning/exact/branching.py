@@ -78,9 +78,9 @@ _JOINT_MOVES = 200_000
 _CALL_WORK = 8
 _BYTES_PER_S = 1_000_000_000
 """Approximate speed at which arrays are filled."""
-_MAX_MOVES, _S_PER_MOVE = 5_000_000, 5e-8
-"""Maximum number of moves of all teams in all steps, and the time for each until the first bound is
-known. Larger problems are mostly empty: TAPPA plans them."""
+_MAX_WORK, _S_PER_WORK = 20_000_000, 1.5e-8
+"""Maximum number of moves towards each pair's target in all steps, and the time for each until the
+first bound is known. Larger problems are mostly empty: TAPPA plans them."""
 _MAX_SHARE = 0.5
 """Maximum share of the remaining time that this may take."""
 _ITERATIONS_PER_NODE = 20
@@ -101,8 +101,9 @@ def call_kernels() -> None:
 
 
 class Branching(Search):
-    """Branch and bound; aborts if it is stuck (`branching_kernel.STUCK`), or out of memory, or if
-    the problem is too large.
+    """Branch and bound.
+
+    Aborts if it is stuck (`branching_kernel.STUCK`), out of memory, or the problem is too large.
     """
 
     def __init__(self, problem: Problem, choices: Sequence[frozenset[int]], budget: Budget) -> None:
@@ -198,11 +199,11 @@ class Branching(Search):
         moves, masses = groups * displacements * cells, groups + self._arrays.residue_count
         size = 8 * cells * len(self._teams.pair_cell) + 33 * moves + 8 * cliques * (masses + 3)
         size = int(steps * (size + nodes * (moves + 8 * cliques)))
-        setup_s = _S_PER_MOVE * steps * moves
+        work = steps * displacements * cells * len(self._teams.pair_cell)
         if (
             size >= self._budget.max_bytes
-            or steps * moves > _MAX_MOVES
-            or setup_s > _MAX_SHARE * self._budget.left_s
+            or work > _MAX_WORK
+            or _S_PER_WORK * work > _MAX_SHARE * self._budget.left_s
         ):
             return False
         self._budget.check_time(size / _BYTES_PER_S)

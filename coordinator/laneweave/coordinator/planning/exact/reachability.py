@@ -10,9 +10,9 @@ given number of joint moves the search ends without a result.
 from __future__ import annotations
 
 import heapq
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache
-from itertools import product
+from itertools import count, product
 
 import attrs
 
@@ -24,7 +24,7 @@ from laneweave.protocol.lattice import Mode, displacements
 State = tuple[int, ...]
 """The cells of all vehicles, team by team, sorted within each team."""
 
-_MOVES_PER_TIME_CHECK = 256
+_LOOKS_PER_TIME_CHECK = 256
 
 
 @attrs.frozen
@@ -65,17 +65,20 @@ def explore(
     distances = [problem.table.distances(sum(1 << cell for cell in goal)) for goal in goals]
     found: dict[State, _Step | None] = {start: None}
     frontier = [(0, 0, start)]
-    move_count = 0
+    move_count, looks = 0, count(1)
+
+    def look_at_clock() -> None:
+        if next(looks) % _LOOKS_PER_TIME_CHECK == 0:
+            budget.check_time()
+
     while frontier:
         _, _, state = heapq.heappop(frontier)
         arrived = all(cell in goal for cell, goal in zip(state, goals, strict=True))
         if arrived and len(set(state)) == len(state):
             return Reachability(solution=_solution(problem, found, state, vehicles))
         successors = _single_moves if one_at_a_time else _joint_moves
-        for moves in successors(problem.table, state, undrivable):
+        for moves in successors(problem.table, state, undrivable, look_at_clock):
             move_count += 1
-            if move_count % _MOVES_PER_TIME_CHECK == 0:
-                budget.check_time()
             if move_count > max_moves:
                 return Reachability()
             successor, order = _sorted_by_team([problem.table.landing(m) for m in moves], team)
@@ -109,10 +112,11 @@ def can_be_made_one_after_another(mode: Mode, model: ConflictModel) -> bool:
 
 
 def _single_moves(
-    table: MoveTable, state: State, undrivable: Sequence[int]
+    table: MoveTable, state: State, undrivable: Sequence[int], look: Callable[[], None]
 ) -> Iterator[tuple[int, ...]]:
-    """Yield the joint moves in which one vehicle moves."""
+    """Yield the joint moves in which one vehicle moves; `look` at the clock for each vehicle."""
     for i, cell in enumerate(state):
+        look()
         options = table.starting_in(1 << cell) & ~(1 << cell | undrivable[i])
         for j, other in enumerate(state):
             if j != i:
@@ -125,17 +129,19 @@ def _joint_moves(
     table: MoveTable,
     state: State,
     undrivable: Sequence[int],
+    look: Callable[[], None],
     chosen: tuple[int, ...] = (),
     forbidden: int = 0,
 ) -> Iterator[tuple[int, ...]]:
-    """Yield all conflict-free joint moves."""
+    """Yield all conflict-free joint moves; `look` at the clock for each choice of a vehicle."""
+    look()
     if len(chosen) == len(state):
         yield chosen
         return
     number = len(chosen)
     for move in bits(table.starting_in(1 << state[number]) & ~(forbidden | undrivable[number])):
         conflicting = forbidden | table.conflicts[move]
-        yield from _joint_moves(table, state, undrivable, (*chosen, move), conflicting)
+        yield from _joint_moves(table, state, undrivable, look, (*chosen, move), conflicting)
 
 
 def _sorted_by_team(cells: Sequence[int], team: Sequence[int]) -> tuple[State, tuple[int, ...]]:

@@ -182,15 +182,14 @@ class ConstraintTree:
             if diagram is None:
                 return None
             diagrams.append(diagram)
-        paths = []
-        for diagram in diagrams:
-            self._budget.check_time()
-            paths.append(choose_path(table, diagram, [0] * diagram.cost))
+        paths = tuple(
+            choose_path(table, diagram, [0] * diagram.cost, self._budget) for diagram in diagrams
+        )
         conflicts: set[Conflict] = set()
         for vehicle in range(len(paths)):
             self._budget.check_time()
             conflicts.update(self._conflicts_of(vehicle, diagrams, paths))
-        return Node((), tuple(paths), tuple(sorted(conflicts)), tuple(diagrams))
+        return Node((), paths, tuple(sorted(conflicts)), tuple(diagrams))
 
     def _constraints(self, node: Node) -> Iterator[Constraint]:
         """Yield the constraint that each child of a node adds."""
@@ -245,10 +244,9 @@ class ConstraintTree:
                 for i, (path, other) in enumerate(zip(paths, diagrams, strict=True))
                 if i != vehicle
             ]
-            self._budget.check_time()
             diagram = diagrams[vehicle]
             conflicting = conflicting_moves(table, others, diagram.cost)
-            paths[vehicle] = choose_path(table, diagram, conflicting)
+            paths[vehicle] = choose_path(table, diagram, conflicting, self._budget)
         conflicts = set(node.conflicts)
         for vehicle in rerouted:
             conflicts = {c for c in conflicts if vehicle not in (c.first, c.second)}
