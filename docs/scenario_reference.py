@@ -118,7 +118,8 @@ def _allowed(attribute: attrs.Attribute[Any]) -> str:
         "_fleets": "table of shards `I/N` or lists of vehicles, by name",
         "_conflict_kinds": "any of " + ", ".join(f"`{kind}`" for kind in CONFLICT_KINDS),
     }
-    return rules[getattr(attribute.validator, "__name__", "")]
+    rule = getattr(attribute.validator, "validator", attribute.validator)  # of `optional`
+    return rules[getattr(rule, "__name__", "")]
 
 
 def _number(value: float) -> str:

@@ -107,20 +107,21 @@ class FormationsOperation:
         """Measure the ratio of road time to the node's clock."""
         self._planner.pace.on_clock(t_s, now_s)
 
-    def on_state(self, state: VehicleState, now_s: float) -> list[LogEntry]:
-        """Pass the state to the leader of its formation."""
+    def on_state(self, state: VehicleState, now_s: float) -> list[LogEntry] | None:
+        """Pass the state to the leader of its formation; return None if nothing depends on it."""
         # Formations stay joined under any leader.
         self._groups.join((state.block, *state.record.joined))
         group = self._groups.of(state.block)
         leader = self.leaders.get(group[0])
-        if leader is None or leader.formation.numbers != group:
-            return []
-        issuing = leader.phase is BallotPhase.ISSUING
-        leader.on_state(state, now_s)
-        if issuing and leader.phase is BallotPhase.IN_FORCE:
-            data = {"formation": group[0], "closed_s": leader.formation.closed_s}
-            return [LogEntry(PLAN_IN_FORCE, data)]
-        return []
+        if leader is not None and leader.formation.numbers == group:
+            before, wakeup_s = leader.phase, leader.wakeup_s
+            leader.on_state(state, now_s)
+            if before is BallotPhase.ISSUING and leader.phase is BallotPhase.IN_FORCE:
+                data = {"formation": group[0], "closed_s": leader.formation.closed_s}
+                return [LogEntry(PLAN_IN_FORCE, data)]
+            if (leader.phase, leader.wakeup_s) != (before, wakeup_s):
+                return []
+        return [] if self._groups.changed else None
 
     def lead(
         self, census: Census, t_s: float, now_s: float, *, changed: bool
