@@ -22,7 +22,7 @@ from laneweave.coordinator.formations.roster import Numbers
 from laneweave.coordinator.formations.stages import Stage
 from laneweave.coordinator.planning.budget import Clock
 from laneweave.coordinator.planning.grid import Grid
-from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
+from laneweave.coordinator.planning.request import MAX_STEPS, PlanRequest, VehicleRequest
 from laneweave.coordinator.planning.response import PlanFunction, PlanResponse
 from laneweave.coordinator.planning.targets import (
     choose_lanes,
@@ -38,9 +38,11 @@ from laneweave.protocol.wire.reasons import BLOCKED, CLOSED_LANE, NO_AGENT, NO_R
 
 MAX_PLACEMENTS = 6
 """Maximum number of parallel structures to try if the first one takes too many steps."""
-MAX_EXTRA_STEPS = 4
-"""If a plan into lanes takes too many steps, plans with at most as many as fit are sought, then
-with one more, and so on, up to this number of plans."""
+MAX_SHORTER_PLANS = 4
+"""If a plan into lanes takes too many steps, this many plans are sought, with at most as many steps
+as fit, then with one more, and so on."""
+NODES_SHARE = 0.25
+"""Share of the search nodes that each of these plans may use."""
 MIN_DEADLINE_S = 0.05
 """Minimum deadline for one attempt."""
 
@@ -61,8 +63,8 @@ class SortingTask:
     """Mode, conflict kinds, lattice."""
     deadline_s: float
     """Deadline for all attempts together [s]."""
-    steps: int = 1_000_000
-    """Number of steps that fit on the road; if a plan has more, other targets are tried."""
+    steps: int = MAX_STEPS
+    """Number of steps that fit on the road; if a plan has more, others are sought."""
     deserted: Numbers = ()
     """Blocks of `numbers` in which only the members' hold cells may be used."""
     structure: DrivingStructure | None = None
@@ -176,7 +178,7 @@ class Sorting:
 
 
 def plan_requests(task: SortingTask, exempt: Name | None = None) -> Iterator[PlanRequest]:
-    """Yield one plan request for each choice of the targets, best choice first.
+    """Yield plan requests: the first one, and those to try if its plan has too many steps.
 
     Args:
         task: a task with at least one vehicle that can move.
@@ -196,7 +198,8 @@ def plan_requests(task: SortingTask, exempt: Name | None = None) -> Iterator[Pla
     else:
         request = _into_lanes(task, wanted)
         yield request
-        for steps in range(task.steps, task.steps + MAX_EXTRA_STEPS):
+        first = max(1, task.steps)
+        for steps in range(first, first + MAX_SHORTER_PLANS):
             yield evolve(request, max_steps=steps)
 
 
@@ -293,29 +296,26 @@ def sort_lanes(
     if not task.movers:
         return _sorting(task, None)
     memory_mb = task.scenario.service.worker_memory_mb
-    make_plan = partial(plan, max_nodes=max_nodes, max_memory_mb=memory_mb, clock=clock)
+    make_plan = partial(plan, max_memory_mb=memory_mb, clock=clock)
     if task.structure is not None:
-        return _form(task, task.structure, make_plan)
+        return _form(task, task.structure, partial(make_plan, max_nodes=max_nodes))
     ends_s = clock() + task.deadline_s
     for exempt in (None, *task.movers):
         best: PlanResponse | None = None
         for request in plan_requests(task, exempt):
-            left_s = ends_s - clock()
-            if best is not None and (left_s <= MIN_DEADLINE_S or _steps(best) <= _limit(request)):
+            left_s, limit = ends_s - clock(), request.max_steps
+            if best is not None and (left_s <= MIN_DEADLINE_S or _steps(best) <= (limit or 0)):
                 break
-            response = make_plan(evolve(request, deadline_s=max(left_s, MIN_DEADLINE_S)))
+            nodes = max_nodes if limit is None else math.ceil(NODES_SHARE * max_nodes)
+            asked = evolve(request, deadline_s=max(left_s, MIN_DEADLINE_S))
+            response = make_plan(asked, max_nodes=nodes)
             if best is None or _steps(response) < _steps(best):
                 best = response
-            if _steps(best) <= task.steps or not (response.paths or request.max_steps):
+            if _steps(best) <= task.steps or (limit is None and not response.paths):
                 break
         if best is not None and best.status != "infeasible":
             break
     return _sorting(task, best)
-
-
-def _limit(request: PlanRequest) -> float:
-    """Return the maximum number of steps of the plans that answer a request."""
-    return 0 if request.max_steps is None else request.max_steps
 
 
 def _steps(response: PlanResponse) -> float:

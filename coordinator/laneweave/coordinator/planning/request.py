@@ -49,7 +49,8 @@ MAX_VEHICLES: Final = 200
 MAX_TARGETS: Final = 400
 MAX_ID_LENGTH: Final = 100
 MAX_DEADLINE_S: Final = 3600.0
-MAX_STEPS: Final = 1_000_000
+MAX_STEPS: Final = 10_000
+"""Maximum number of steps of a plan, where it is limited."""
 
 _KNOWN_KEYS: Final = "only known keys"
 _NOT_BOTH: Final = "structure or targets, not both"
@@ -85,8 +86,8 @@ class PlanRequest:
     lanes: lanes of the structure; None: all.
     max_steps: maximum number of steps of the plan; None: any number.
     geometry: defines the conflict kind `geometric`; None: footprints.
-    solver: name of a solver, built in or a plug-in where the request is answered; None: the
-        default there.
+    solver: name of a solver, built in or a plug-in where the request is answered; None: that of
+        the coordinator, or the planner chooses.
     id: a service plans pending requests with the same id once; empty: no id.
     """
 

@@ -27,7 +27,9 @@ from laneweave.coordinator.planning.problem import (
 def shortest_paths(table: MoveTable, start: int, target: int, bans: Bans) -> Diagram | None:
     """Return all paths of minimum cost that respect the bans, or None if there is no path."""
     last_ban = max(*bans.at, *bans.since, bans.earliest, -1)
-    limit = last_ban + table.cell_count + 2 if bans.latest is None else bans.latest
+    limit = last_ban + table.cell_count + 2
+    if bans.latest is not None:
+        limit = min(limit, bans.latest)
     arrival = bans.earliest
     for step, banned in bans.at.items():
         if banned >> target & 1:

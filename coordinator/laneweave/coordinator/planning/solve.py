@@ -29,6 +29,11 @@ With more vehicles than the joint search can plan, TAPPA needs 3 to 5 s of CPU f
 share of a scenario's default limit; branching needs 0.1 s for formations of six to eight (95th
 percentile), at most 0.6 s.
 """
+SPARSE_CELLS: Final = 20
+"""Number of free cells for each vehicle, of at least `FEW_VEHICLES`, above which TAPPA plans first
+unless a solver is named: vehicles hardly meet, and branching needs arrays over all cells and steps.
+"""
+FEW_VEHICLES: Final = 10
 PLUG_IN_SHARE: Final = 0.5
 """Share of the deadline for a planner of a user; if it fails, built-in solvers need the rest."""
 MAX_NODES: Final = 500_000
@@ -57,7 +62,8 @@ def plan(
 ) -> PlanResponse:
     """Answer one request; check the plan with `plan_validator`.
 
-    Identical requests get identical plans unless the deadline passes first.
+    Identical requests get identical plans, unless the deadline passes first or is so short that it
+    leaves no time for the arrays of branching.
 
     Args:
         request: what to plan.
@@ -132,8 +138,11 @@ def _order(requested: str | None, problem: Problem, *, fallback: bool) -> tuple[
         return (requested, *_order(None, problem, fallback=fallback))
     if problem.table.model.vehicles_share_cells:
         return ("tappa",)
-    if requested == "tappa":
-        return ("tappa", "branching") if fallback else ("tappa",)
+    if requested == "tappa" and not fallback:
+        return ("tappa",)
+    is_sparse = problem.table.cell_count > SPARSE_CELLS * max(len(problem.starts), FEW_VEHICLES)
+    if requested == "tappa" or (requested is None and is_sparse):
+        return ("tappa", "branching")
     return ("branching", "tappa")
 
 

@@ -11,7 +11,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from laneweave.coordinator.formations.roster import Numbers
-from laneweave.coordinator.formations.sorting import Sorting, SortingTask, plan_requests, sort_lanes
+from laneweave.coordinator.formations.sorting import (
+    Sorting,
+    SortingTask,
+    plan_requests,
+    sort_lanes,
+)
 from laneweave.coordinator.formations.stages import stages
 from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.coordinator.planning.response import PlanResponse
@@ -249,6 +254,24 @@ def test_all_placements_share_one_deadline() -> None:
     assert len(list(plan_requests(hurried))) > 3
     assert sort_lanes(hurried, NODES, slow_plan, lambda: now_s[0]).solved
     assert asked == [5.0, 3.0, 1.0]
+
+
+@pytest.mark.parametrize("steps", [-2, 0, 1])
+def test_without_time_for_a_step_the_shortest_of_some_plans_is_taken(steps: int) -> None:
+    """It may still end in time; a formation has fewer steps left than its members."""
+    scenario = evolve(SCENARIO, formation=evolve(FORMATIONS, targets="lane", solver=None))
+    cells = {A: (0, 0), B: (-1, 1), C: (-2, 0), D: (-3, 1), E: (0, 2), F: (-2, 2)}
+    order = task(cells, {A: 2, B: 2, C: 1, D: 0, E: 0, F: 1}, scenario=scenario)
+    asked = list[int | None]()
+
+    def count(request: PlanRequest, **limits: Any) -> PlanResponse:  # noqa: ANN401
+        asked.append(request.max_steps)
+        return plan(request, **limits)
+
+    found = sort_lanes(evolve(order, steps=steps), NODES, count, time.monotonic)
+    assert found.response is not None
+    assert found.response.steps == 3
+    assert asked == [None, 1, 2]
 
 
 LANES_ONLY = frozenset({(0, 1), (0, -1)})

@@ -18,7 +18,7 @@ import laneweave.protocol
 from laneweave.coordinator.planning.grid import Grid
 from laneweave.coordinator.planning.paper.assignments import Weights
 from laneweave.coordinator.planning.plan_validator import problems_of_response
-from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
+from laneweave.coordinator.planning.request import MAX_STEPS, PlanRequest, VehicleRequest
 from laneweave.coordinator.planning.response import PlanResponse
 from laneweave.coordinator.planning.solve import plan
 from laneweave.launch.bench.request_families import block_request, formation_request
@@ -71,6 +71,23 @@ def test_plans_have_no_more_steps_than_are_permitted(
 ) -> None:
     limited = attrs.evolve(request, max_steps=steps)
     assert faults(limited.to_dict(), cheapest_plan(limited), solver) == []
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_a_generous_limit_on_steps_costs_nothing(solver: str) -> None:
+    """Some vehicles of the constraint trees can never arrive; they are given up at once."""
+    corridor = _corridor(((4, 0), 1), ((3, 0), 2), ((0, 0), 3), ((1, 0), 0), columns=5)
+    request = attrs.evolve(
+        corridor,
+        conflicts=("node", "edge", "special-1", "closing"),
+        vehicles=tuple(attrs.evolve(one, eligible=None) for one in corridor.vehicles),
+    )
+    free, limited = (
+        plan(attrs.evolve(request, max_steps=steps), solver=solver, fallback=False)
+        for steps in (None, MAX_STEPS)
+    )
+    assert (limited.status, limited.cost) == (free.status, free.cost) == ("optimal", 3)
+    assert limited.nodes_expanded == free.nodes_expanded
 
 
 def crowded(seed: int, max_steps: int) -> PlanRequest:

@@ -7,6 +7,7 @@ import math
 import attrs
 import pytest
 
+from laneweave.coordinator.planning.grid import Grid
 from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.coordinator.planning.response import PlanResponse
 from laneweave.coordinator.planning.solve import TAPPA_SHARE, plan
@@ -25,6 +26,13 @@ def test_branching_plans_unless_another_solver_is_named() -> None:
     assert plan(EASY).solver == "branching"
     assert plan(attrs.evolve(EASY, solver="branching")).solver == "branching"
     assert plan(attrs.evolve(EASY, solver="branching"), solver="tappa").solver == "tappa"
+
+
+def test_tappa_plans_first_on_boards_that_are_nearly_empty() -> None:
+    wide = attrs.evolve(EASY, grid=Grid(200, 3))
+    assert plan(wide).solver == "tappa"
+    assert plan(wide, solver="branching").solver == "branching"
+    assert plan(wide).cost == plan(wide, solver="branching").cost
 
 
 def test_a_plan_in_time_is_no_fallback() -> None:

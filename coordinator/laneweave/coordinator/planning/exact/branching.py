@@ -25,6 +25,7 @@ for a path set or proves that there is none. With few vehicles, A* over the cell
 from __future__ import annotations
 
 import math
+import sys
 import time
 from collections.abc import Sequence
 from itertools import pairwise
@@ -78,11 +79,12 @@ _JOINT_MOVES = 200_000
 _CALL_WORK = 8
 _BYTES_PER_S = 1_000_000_000
 """Approximate speed at which arrays are filled."""
-_MAX_WORK, _S_PER_WORK = 20_000_000, 1.5e-8
-"""Maximum number of moves towards each pair's target in all steps, and the time for each until the
-first bound is known. Larger problems are mostly empty: TAPPA plans them."""
-_MAX_SHARE = 0.5
-"""Maximum share of the remaining time that this may take."""
+_MAX_WORK = 20_000_000
+"""Maximum number of moves, summed over all steps and pairs of a team and a target. Larger problems
+are mostly empty: TAPPA plans them."""
+_S_PER_WORK, _MAX_SHARE = 1.5e-8, 0.5
+"""Time for each of these until the first bound is known; the maximum share of the remaining time
+that it may take."""
 _ITERATIONS_PER_NODE = 20
 """Number of iterations that a node takes, before the first one has been timed."""
 
@@ -148,7 +150,9 @@ class Branching(Search):
             self.lower_bound, self.finished = math.inf, True
             return
         steps = self._longest_path() + _SPARE_STEPS
-        if not self._fits(steps, _FIRST_STACK):
+        if self._problem.max_steps is not None:
+            steps = min(steps, self._problem.max_steps + 1)
+        if self._is_too_large(steps) or not self._fits(steps, _FIRST_STACK):
             self.aborted = True
             return
         root = self.relaxation(steps)
@@ -188,8 +192,13 @@ class Branching(Search):
         self._keep_relaxed_solution(root)
         self.lower_bound = max(self.lower_bound, root.min_cost)
 
+    def _is_too_large(self, steps: int) -> bool:
+        """Return whether the relaxed problem is too large, for any deadline or for this one."""
+        work = steps * self._arrays.valid.size * len(self._teams.pair_cell)
+        return work > _MAX_WORK or _S_PER_WORK * work > _MAX_SHARE * self._budget.left_s
+
     def _fits(self, steps: int, nodes: int) -> bool:
-        """Return whether the arrays for a number of steps and nodes fit within the limits.
+        """Return whether the arrays for a number of steps and nodes fit within the memory limit.
 
         Raises:
             BudgetSpentError: they fit, but there is no time left to fill them.
@@ -199,12 +208,7 @@ class Branching(Search):
         moves, masses = groups * displacements * cells, groups + self._arrays.residue_count
         size = 8 * cells * len(self._teams.pair_cell) + 33 * moves + 8 * cliques * (masses + 3)
         size = int(steps * (size + nodes * (moves + 8 * cliques)))
-        work = steps * displacements * cells * len(self._teams.pair_cell)
-        if (
-            size >= self._budget.max_bytes
-            or work > _MAX_WORK
-            or _S_PER_WORK * work > _MAX_SHARE * self._budget.left_s
-        ):
+        if size >= self._budget.max_bytes:
             return False
         self._budget.check_time(size / _BYTES_PER_S)
         return True
@@ -379,6 +383,7 @@ class Branching(Search):
         if reached.infeasible:
             self.lower_bound, self.finished = math.inf, True
         elif reached.solution is not None:
+            self._explore_nodes = sys.maxsize  # it would find the same path set again
             self._keep_if_better(
                 without_needless_moves(self._problem, reached.solution, self._budget)
             )

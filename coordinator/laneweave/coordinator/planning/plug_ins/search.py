@@ -15,13 +15,11 @@ from laneweave.coordinator.planning.plug_ins.registry import (
     PlannerFailedError,
 )
 from laneweave.coordinator.planning.problem import Problem, Search, Solution
-from laneweave.coordinator.planning.request import PlanRequest
+from laneweave.coordinator.planning.request import MAX_STEPS, PlanRequest
 from laneweave.protocol.lattice import Cell
 
 log = structlog.get_logger(__name__)
 
-MAX_STEPS: Final = 10_000
-"""Maximum length of a path."""
 _PROBLEMS_SHOWN: Final = 3
 
 
