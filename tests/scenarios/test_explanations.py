@@ -148,7 +148,7 @@ CASES = {
         Reason.NO_ANSWER, ("v0004, v0005, v0006", "did not answer the leader"), PLANS_LOST
     ),
     "the road is too short": Case(
-        Reason.ROAD_TOO_SHORT, ("too short for its plan of 3 steps until 24.9 s",), None, SHORT
+        Reason.ROAD_TOO_SHORT, ("too short for its plan of 2 steps until 20.9 s",), None, SHORT
     ),
     "it stops before the end of its lane": Case(
         Reason.STOPPED,

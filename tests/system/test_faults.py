@@ -111,14 +111,14 @@ def test_a_leader_that_is_killed_is_replaced(
     made = plans(folder)
     planned_s = [event["t_s"] for event in made]
     assert min(planned_s) < killed_at_s < max(planned_s)
-    # Both leaders planned as the paper does, for formations, and every vehicle got its path.
+    # Both leaders planned for formations, and every vehicle got its path.
     makers = {event["name"] for event in made}
     assert 1 < len(makers) <= len(leaders)
     assert makers <= leaders
     assert {event["kind"] for event in made} == {"plan-made"}
-    assert {(event["solver"], event["status"]) for event in made} == {("tappa", "optimal")}
+    assert {(event["solver"], event["status"]) for event in made} == {("branching", "optimal")}
     assert sum(event["vehicles"] for event in made) >= found["vehicles"]["entered"]
-    assert found["planning"]["by_solver"]["tappa"] == len(made)
+    assert found["planning"]["by_solver"]["branching"] == len(made)
     assert [line for line in log_lines(folder) if line["level"] == "error"] == []
 
 
