@@ -38,7 +38,7 @@ NOTICED: list[tuple[str, Bug, int]] = [
     (FORMATIONS, road_bugs.types_are_ignored, 11),
     (SURPRISES, road_bugs.controllers_do_not_know, 1),
     (SURPRISES, road_bugs.parts_open_while_vehicles_wait, 0),
-    (WITH_FORMATIONS, road_bugs.controllers_do_not_know, 1),
+    (WITH_FORMATIONS, road_bugs.controllers_do_not_know, 3),
 ]
 """Profiles, bugs, and a seed that catches each."""
 

@@ -54,7 +54,7 @@ def test_the_planning_service(lab: Lab) -> None:
     router = start_router(lab, config)
     # A network without a coordinator is told from a network that is not there.
     assert ask(lab, config, REQUEST).status == 2
-    coordinator = lab.start("coordinator", "--config", config, "--solver", "branching")
+    coordinator = lab.start("coordinator", "--config", config, "--solver", "tappa")
     lab.wait_until(lambda: ask(lab, config, REQUEST).status == 0, END_S)
 
     there = json.loads(ask(lab, config, REQUEST).out)
@@ -63,9 +63,9 @@ def test_the_planning_service(lab: Lab) -> None:
     assert there["schema"] == "laneweave.plan.response/1"
     assert there["status"] == here["status"] == "optimal"
     assert there["cost"] == here["cost"] == here["lower_bound"]
-    assert (there["solver"], here["solver"]) == ("branching", "tappa")
-    table = ask(lab, config, REQUEST, "--format", "table", "--solver", "tappa").out
-    assert "planned by tappa" in table
+    assert (there["solver"], here["solver"]) == ("tappa", "branching")
+    table = ask(lab, config, REQUEST, "--format", "table", "--solver", "branching").out
+    assert "planned by branching" in table
     assert table == lab.finish(lab.start("plan", path, "--format", "table"), RUN_S).out
     assert f"cost {here['cost']}" in table
     assert len(table.splitlines()) > 3

@@ -79,7 +79,7 @@ def test_a_formation_takes_on_one_structure_after_the_other(tmp_path: Path) -> N
     events, cells = drive(scenario, tmp_path, arrivals)
     plans = of_kind(events, "plan-made")
     assert [plan["vehicles"] for plan in plans] == [6, 6, 6]
-    assert {plan["solver"] for plan in plans} == {"tappa"}
+    assert {plan["solver"] for plan in plans} == {"branching"}
 
     interlaced = before(cells, plans[1])
     assert len({(column + lane) % 2 for column, lane in interlaced.values()}) == 1
