@@ -1,13 +1,12 @@
-"""Requests that cost planners the most: is the answer in time, and how much memory does it take?
+"""Measure the delay after the deadline and the memory of plans for difficult requests.
 
     python benchmarks/hostile_requests.py [--solver NAME ...] [--instances N] [--seed N]
                                           [--json FILE]
 
-Random boards of 2 to 60 vehicles: crowded, divided by obstacles, nearly full, with hundreds of
-columns, one alcove beside a single lane; both motion modes, all conflict kinds, targets of one's
-own or shared, deadlines of 0.2 to 4 s. Each request is planned in a process of its own, with
-compiled code loaded. Time is wall time from the request to the response beyond the deadline; memory
-is the peak of the process.
+Random grids with 2 to 60 vehicles: crowded, divided by obstacles, nearly full, with hundreds of
+columns, or a single lane with one alcove; both motion modes, several sets of conflict kinds, one
+target per vehicle or shared targets, deadlines of 0.2 to 4 s. Each request is planned in a new
+process with compiled code loaded. The delay is wall time; memory is the peak of the process.
 """
 
 from __future__ import annotations
@@ -21,6 +20,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable
+from itertools import product
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -44,28 +44,28 @@ MAX_VEHICLES, LIMIT_S = 60, 60.0
 
 
 def crowded(rng: random.Random) -> tuple[Grid, int]:
-    """Return a board with few empty cells, and the number of its vehicles."""
+    """Return a grid and a number of vehicles that leaves few empty cells."""
     grid = Grid(rng.randint(2, 12), rng.randint(2, 8))
     cells = grid.columns * grid.lanes
     return grid, min(MAX_VEHICLES, cells - rng.randint(1, max(1, cells // 4)))
 
 
 def obstacles(rng: random.Random) -> tuple[Grid, int]:
-    """Return a board with obstacles, which may divide it."""
+    """Return a grid with obstacles, which may divide it, and a number of vehicles."""
     columns, lanes = rng.randint(3, 20), rng.randint(2, 8)
-    cells = [(column, lane) for column in range(columns) for lane in range(lanes)]
+    cells = [*product(range(columns), range(lanes))]
     blocked = rng.sample(cells, int(len(cells) * rng.uniform(0.1, 0.5)))
     free = len(cells) - len(blocked)
     return Grid(columns, lanes, tuple(sorted(blocked))), rng.randint(2, min(MAX_VEHICLES, free))
 
 
 def long_board(rng: random.Random) -> tuple[Grid, int]:
-    """Return a board with hundreds of columns."""
+    """Return a grid with hundreds of columns, and a number of vehicles."""
     return Grid(rng.randint(100, 1000), rng.randint(1, 16)), rng.randint(2, MAX_VEHICLES)
 
 
 def alcove(rng: random.Random) -> tuple[Grid, int]:
-    """Return a single lane with one alcove beside it."""
+    """Return a single lane with one alcove beside it, and a number of vehicles."""
     columns = rng.randint(3, 12)
     place = rng.randrange(columns)
     blocked = tuple((column, 1) for column in range(columns) if column != place)
@@ -73,7 +73,7 @@ def alcove(rng: random.Random) -> tuple[Grid, int]:
 
 
 def board(rng: random.Random) -> tuple[Grid, int]:
-    """Return a board of any size and any number of vehicles."""
+    """Return a grid of medium size, and a number of vehicles."""
     grid = Grid(rng.randint(4, 40), rng.randint(2, 8))
     return grid, rng.randint(2, min(MAX_VEHICLES, grid.columns * grid.lanes - 1))
 
@@ -88,17 +88,11 @@ FAMILIES: dict[str, Callable[[random.Random], tuple[Grid, int]]] = {
 
 
 def hostile_request(seed: int) -> tuple[str, PlanRequest]:
-    """Return the family and the request of a seed."""
+    """Return a random request and the name of its family."""
     rng = random.Random(seed)  # noqa: S311
     family = list(FAMILIES)[seed % len(FAMILIES)]
     grid, vehicles = FAMILIES[family](rng)
-    blocked = {*grid.blocked}
-    free: list[Cell] = [
-        (column, lane)
-        for column in range(grid.columns)
-        for lane in range(grid.lanes)
-        if (column, lane) not in blocked
-    ]
+    free: list[Cell] = [*filter(grid.is_free, product(range(grid.columns), range(grid.lanes)))]
     starts = rng.sample(free, vehicles)
     targets = rng.sample(free, min(len(free), 400, vehicles + rng.choice((0, 0, vehicles))))
     kind = rng.choice(("own", "any", "half"))
@@ -126,7 +120,7 @@ def hostile_request(seed: int) -> tuple[str, PlanRequest]:
 
 
 def answer(seed: int, solver: str | None, result: Connection) -> None:
-    """Plan the request of a seed; put time, memory and status into a connection."""
+    """Plan the request of a seed, and send the measurements."""
     family, request = hostile_request(seed)
     began_s = time.monotonic()
     response = plan(request, solver=solver)
@@ -149,7 +143,7 @@ def answer(seed: int, solver: str | None, result: Connection) -> None:
 
 
 def answered(seed: int, solver: str | None) -> dict[str, Any]:
-    """Return what `answer` found out in a process of its own, or how this process ended."""
+    """Run `answer` in a new process; return its measurements, or how the process ended."""
     context = multiprocessing.get_context("fork")
     receiver, sender = context.Pipe(duplex=False)
     process = context.Process(target=answer, args=(seed, solver, sender))
@@ -165,7 +159,7 @@ def answered(seed: int, solver: str | None) -> dict[str, Any]:
 
 
 def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """Return what is late, how large processes grow, and what became of the requests."""
+    """Return the number of requests by status, the longest delay and the largest peak memory."""
     timed = [row for row in rows if "late_s" in row]
     return {
         "requests": len(rows),

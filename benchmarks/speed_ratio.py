@@ -1,12 +1,12 @@
-"""Has the code become slower? CPU time of a simulated run, divided by that of an earlier commit.
+"""Measure the CPU time of a simulated run, relative to an earlier commit.
 
     python benchmarks/speed_ratio.py [--base COMMIT] [--rounds N] [--operation NAME]
                                      [--volume VEH_PER_LANE_H] [--duration S] [--limit RATIO]
 
-Both commits drive the same demand, in turn, each time in a process of its own, with the libraries
-of this interpreter. Importing does not count. Prints the median over the rounds, and ends with
-status 1 if it is above the limit. At the default volume formations are planned without compiled
-code, which the earlier commit would have to compile first.
+Both commits run with the same demand, alternately, each time in a new process with the libraries of
+this interpreter. Imports do not count. Prints the median ratio of the rounds; the exit status is 1
+if it is above the limit. At the default volume, formations are planned without compiled code, which
+the earlier commit would have to compile first.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 BASE = "31659603"
-"""Before lanes became the targets of formations: what later commits are compared with."""
+"""Commit to compare with: the last one in which formations sorted into the parallel structure."""
 PARTS = ("protocol", "coordinator", "agents", "sim_bridge", "launch")
 LIMIT_S = 600.0
 PROGRAM = """

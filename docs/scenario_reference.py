@@ -76,9 +76,13 @@ def default_of(attribute: attrs.Attribute[Any]) -> str:
 
 def limits_of(attribute: attrs.Attribute[Any]) -> Mapping[str, Any]:
     """Return the arguments of a field's validator; empty without a validator."""
-    # For an optional field: the rule for its values.
-    rule = getattr(attribute.validator, "validator", attribute.validator)
+    rule = _rule_of(attribute)
     return {} if rule is None else inspect.getclosurevars(rule).nonlocals
+
+
+def _rule_of(attribute: attrs.Attribute[Any]) -> Any:  # noqa: ANN401 (any validator)
+    """Return the validator of a field; for an optional field, that of its values."""
+    return getattr(attribute.validator, "validator", attribute.validator)
 
 
 def range_of(limits: Mapping[str, Any]) -> str:
@@ -118,8 +122,7 @@ def _allowed(attribute: attrs.Attribute[Any]) -> str:
         "_fleets": "table of shards `I/N` or lists of vehicles, by name",
         "_conflict_kinds": "any of " + ", ".join(f"`{kind}`" for kind in CONFLICT_KINDS),
     }
-    rule = getattr(attribute.validator, "validator", attribute.validator)  # of `optional`
-    return rules[getattr(rule, "__name__", "")]
+    return rules[getattr(_rule_of(attribute), "__name__", "")]
 
 
 def _number(value: float) -> str:

@@ -1,4 +1,4 @@
-"""The code does not become slower unnoticed: CPU time relative to an earlier commit."""
+"""CPU time of a simulated run, relative to an earlier commit."""
 
 import subprocess
 import sys

@@ -108,7 +108,7 @@ class FormationsOperation:
         self._planner.pace.on_clock(t_s, now_s)
 
     def on_state(self, state: VehicleState, now_s: float) -> list[LogEntry] | None:
-        """Pass the state to the leader of its formation; return None if nothing depends on it."""
+        """Pass the state to the leader of its formation; return None if it changes nothing."""
         # Formations stay joined under any leader.
         self._groups.join((state.block, *state.record.joined))
         group = self._groups.of(state.block)

@@ -37,12 +37,12 @@ from laneweave.protocol.wire.messages import Name
 from laneweave.protocol.wire.reasons import BLOCKED, CLOSED_LANE, NO_AGENT, NO_ROOM, TOO_LATE
 
 MAX_PLACEMENTS = 6
-"""Maximum number of parallel structures to try if the first one takes too many steps."""
+"""Maximum number of placements of the parallel structure, if plans have too many steps."""
 MAX_SHORTER_PLANS = 4
-"""If a plan into lanes takes too many steps, this many plans are sought, with at most as many steps
-as fit, then with one more, and so on."""
+"""Maximum number of further requests if the cheapest plan into lanes has too many steps. The first
+one limits the plan to the steps that fit, each later one permits one step more."""
 NODES_SHARE = 0.25
-"""Share of the search nodes that each of these plans may use."""
+"""Share of the node limit for each of these requests."""
 MIN_DEADLINE_S = 0.05
 """Minimum deadline for one attempt."""
 
@@ -64,7 +64,7 @@ class SortingTask:
     deadline_s: float
     """Deadline for all attempts together [s]."""
     steps: int = MAX_STEPS
-    """Number of steps that fit on the road; if a plan has more, others are sought."""
+    """Number of steps that fit on the road; if a plan has more, a shorter one is requested."""
     deserted: Numbers = ()
     """Blocks of `numbers` in which only the members' hold cells may be used."""
     structure: DrivingStructure | None = None

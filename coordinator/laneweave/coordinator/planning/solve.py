@@ -30,10 +30,10 @@ share of a scenario's default limit; branching needs 0.1 s for formations of six
 percentile), at most 0.6 s.
 """
 SPARSE_CELLS: Final = 20
-"""Number of free cells for each vehicle, of at least `FEW_VEHICLES`, above which TAPPA plans first
-unless a solver is named: vehicles hardly meet, and branching needs arrays over all cells and steps.
-"""
+"""Free cells per vehicle above which TAPPA plans first, unless a solver is named: conflicts are
+rare, and branching needs arrays over all cells and steps."""
 FEW_VEHICLES: Final = 10
+"""Minimum number of vehicles for this threshold, so that small grids are left to branching."""
 PLUG_IN_SHARE: Final = 0.5
 """Share of the deadline for a planner of a user; if it fails, built-in solvers need the rest."""
 MAX_NODES: Final = 500_000
@@ -62,8 +62,8 @@ def plan(
 ) -> PlanResponse:
     """Answer one request; check the plan with `plan_validator`.
 
-    Identical requests get identical plans, unless the deadline passes first or is so short that it
-    leaves no time for the arrays of branching.
+    Identical requests get identical plans, unless the deadline passes first or is too short for the
+    set-up of branching.
 
     Args:
         request: what to plan.
@@ -138,11 +138,9 @@ def _order(requested: str | None, problem: Problem, *, fallback: bool) -> tuple[
         return (requested, *_order(None, problem, fallback=fallback))
     if problem.table.model.vehicles_share_cells:
         return ("tappa",)
-    if requested == "tappa" and not fallback:
-        return ("tappa",)
     is_sparse = problem.table.cell_count > SPARSE_CELLS * max(len(problem.starts), FEW_VEHICLES)
     if requested == "tappa" or (requested is None and is_sparse):
-        return ("tappa", "branching")
+        return ("tappa", "branching") if fallback else ("tappa",)
     return ("branching", "tappa")
 
 

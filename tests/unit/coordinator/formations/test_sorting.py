@@ -258,7 +258,7 @@ def test_all_placements_share_one_deadline() -> None:
 
 @pytest.mark.parametrize("steps", [-2, 0, 1])
 def test_without_time_for_a_step_the_shortest_of_some_plans_is_taken(steps: int) -> None:
-    """It may still end in time; a formation has fewer steps left than its members."""
+    """`SortingTask.steps` counts from the front of the formation, so it may be 0 or negative."""
     scenario = evolve(SCENARIO, formation=evolve(FORMATIONS, targets="lane", solver=None))
     cells = {A: (0, 0), B: (-1, 1), C: (-2, 0), D: (-3, 1), E: (0, 2), F: (-2, 2)}
     order = task(cells, {A: 2, B: 2, C: 1, D: 0, E: 0, F: 1}, scenario=scenario)

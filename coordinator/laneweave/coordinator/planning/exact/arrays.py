@@ -102,7 +102,7 @@ def _cliques(
     grid: Grid, patterns: tuple[Clique, ...], displacement_count: int, valid: Bools
 ) -> tuple[Ints, int]:
     """Return each move's cliques of at least two moves on the grid, and the number of cliques."""
-    # In descending order of offsets, so that the indices of a move's cliques ascend.
+    # Sorted by descending offset, so that each move lists its cliques in ascending order.
     members = [
         (number, *member)
         for number, pattern in enumerate(patterns)

@@ -80,13 +80,12 @@ _CALL_WORK = 8
 _BYTES_PER_S = 1_000_000_000
 """Approximate speed at which arrays are filled."""
 _MAX_WORK = 20_000_000
-"""Maximum number of moves, summed over all steps and pairs of a team and a target. Larger problems
-are mostly empty: TAPPA plans them."""
-_S_PER_WORK, _MAX_SHARE = 1.5e-8, 0.5
-"""Time for each of these until the first bound is known; the maximum share of the remaining time
-that it may take."""
+"""Maximum size of the relaxed problem: moves times pairs of a team and a target times steps. Larger
+grids are mostly empty, and TAPPA plans them."""
+_S_PER_WORK, _MAX_SETUP_SHARE = 1.5e-8, 0.5
+"""Set-up time per unit of this size, and the maximum share of the remaining time for the set-up."""
 _ITERATIONS_PER_NODE = 20
-"""Number of iterations that a node takes, before the first one has been timed."""
+"""Estimated number of iterations per node, used until the first node has been timed."""
 
 
 def call_kernels() -> None:
@@ -193,9 +192,9 @@ class Branching(Search):
         self.lower_bound = max(self.lower_bound, root.min_cost)
 
     def _is_too_large(self, steps: int) -> bool:
-        """Return whether the relaxed problem is too large, for any deadline or for this one."""
+        """Return whether the relaxed problem exceeds `_MAX_WORK`, or its set-up takes too long."""
         work = steps * self._arrays.valid.size * len(self._teams.pair_cell)
-        return work > _MAX_WORK or _S_PER_WORK * work > _MAX_SHARE * self._budget.left_s
+        return work > _MAX_WORK or _S_PER_WORK * work > _MAX_SETUP_SHARE * self._budget.left_s
 
     def _fits(self, steps: int, nodes: int) -> bool:
         """Return whether the arrays for a number of steps and nodes fit within the memory limit.
@@ -391,7 +390,7 @@ class Branching(Search):
     def _keep_if_better(self, solution: Solution) -> None:
         """Keep a path set that is cheaper than the best so far, or as cheap with fewer moves.
 
-        The searches that `_run_heuristics` calls do not limit the number of steps.
+        Path sets with too many steps are rejected: negotiation and `explore` do not limit them.
         """
         value = self._value(solution)
         if value < self._best_value and not self._problem.is_too_long(solution):

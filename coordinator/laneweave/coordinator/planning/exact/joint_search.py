@@ -155,7 +155,8 @@ class JointSearch:
     """The search; works in portions.
 
     lower_bound: lower bound on the cost of all path sets; infinite: no path set exists.
-    solution: the optimal path set, once it is found.
+    solution: the optimal path set, once it is found; None if it has too many steps, which the
+        search does not count.
     ended: whether the search is complete or has reached its limits.
     """
 
@@ -211,7 +212,9 @@ class JointSearch:
             if outcome == FULL:
                 self.grow()
             elif outcome == FOUND:
-                self.solution, self.ended = self._found(), True
+                solution, self.ended = self._found(), True
+                if not self._problem.is_too_long(solution):
+                    self.solution = solution
             elif outcome == EMPTY:
                 self._end(below)
             elif self._moves_left <= 0:

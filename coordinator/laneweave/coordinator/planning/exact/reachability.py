@@ -114,7 +114,7 @@ def can_be_made_one_after_another(mode: Mode, model: ConflictModel) -> bool:
 def _single_moves(
     table: MoveTable, state: State, undrivable: Sequence[int], look: Callable[[], None]
 ) -> Iterator[tuple[int, ...]]:
-    """Yield the joint moves in which one vehicle moves; `look` at the clock for each vehicle."""
+    """Yield the joint moves in which one vehicle moves; call `look` for each vehicle."""
     for i, cell in enumerate(state):
         look()
         options = table.starting_in(1 << cell) & ~(1 << cell | undrivable[i])
@@ -133,7 +133,7 @@ def _joint_moves(
     chosen: tuple[int, ...] = (),
     forbidden: int = 0,
 ) -> Iterator[tuple[int, ...]]:
-    """Yield all conflict-free joint moves; `look` at the clock for each choice of a vehicle."""
+    """Yield all conflict-free joint moves; call `look` for each partial joint move."""
     look()
     if len(chosen) == len(state):
         yield chosen

@@ -129,10 +129,7 @@ class Tappa(Search):
 
     def _update_best(self, solution: Solution | None) -> None:
         """Set P* and C'* if a path set is better (lines 6 to 8)."""
-        # The joint search does not count steps.
-        if solution is None or self._problem.is_too_long(solution):
-            return
-        if solution.cost < self.best_cost:
+        if solution is not None and solution.cost < self.best_cost:
             self.best = solution
 
     def _cbsa(self, assignment: Assignment) -> Solution | None:
