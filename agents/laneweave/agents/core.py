@@ -24,6 +24,7 @@ from collections.abc import Callable
 from msgspec.structs import replace
 
 from laneweave.agents.driving.driver import Driver, SolverStats, TrackingDriver
+from laneweave.agents.undisturbed import HoldWatch
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell, PlannedMove, stretch_of
 from laneweave.protocol.road_layout import NO_PARTS, TemporaryParts
@@ -137,6 +138,7 @@ class AgentCore:
         self._lane_ends, self._territory = LaneEnds(scenario), territory_of(scenario)
         self._temporary = NO_PARTS
         self._rules = rules
+        self._hold_watch = HoldWatch(scenario)
         self.wanted_motions: tuple[int, ...] = ()
         """Stretches of columns whose motions are needed now; empty while not in charge."""
         self.wanted_states: tuple[int, ...] = ()
@@ -354,12 +356,13 @@ class AgentCore:
             self.wanted_motions = stretch - 1, stretch, stretch + 1
             self._decide(sense, execution)
         drive = self._driver.drive(sense, moving=execution.moving)
+        hold = self._hold_watch.look(sense, execution, free=drive.free) if in_charge else None
         self._command = Command(
             vehicle=self.vehicle,
             record=execution.wanted,
             tick=sense.tick,
             hold_cell=execution.hold_cell,
-            motion=drive.motion,
+            motion=drive.motion if hold is None else hold,
             jerks=drive.jerks,
         )
         effects: list[Effect] = [Send(COMMAND, self._command, self._own)]
@@ -382,10 +385,14 @@ class AgentCore:
         return [self._state()] if execution.on_record(sense.record) else []
 
     def _request_storage(self, execution: PlanExecution) -> list[Effect]:
-        """Ask the controller to store changes now rather than with the next tick's COMMAND."""
+        """Ask the controller to store changes now rather than with the next tick's COMMAND.
+
+        The vehicle no longer holds undisturbed: it gets a SENSE in the next tick.
+        """
         command = self._command
         assert command is not None  # noqa: S101 (in charge: it has sent one)
-        self._command = replace(command, record=execution.wanted)
+        motion = CurrentMotion(command.hold_cell) if command.undisturbed_ticks else command.motion
+        self._command = replace(command, record=execution.wanted, motion=motion)
         return [Send(COMMAND, self._command, self._own)] if self._command != command else []
 
     def _forget_road(self) -> None:

@@ -193,6 +193,8 @@ class BridgeCore:
         self._tick_began = 0.0
         self._deployment = Deployment(scenario, incarnation, record)
         self._agent_log = AgentLog(self._deployment.fleet_of)
+        self._leader: tuple[Name, int, int] | None = None
+        """Name, incarnation and term of the coordinator that leads."""
         self._passing: set[str] = set()
         """Vehicles of other systems in the world."""
         self._opened_s = self._census_s = 0.0
@@ -325,8 +327,16 @@ class BridgeCore:
             case Heartbeat():
                 self.road.bounds.check(message, self.t_s, now_s)
                 self._record.on_heartbeat(message, self.t_s, now_s)
+                self._on_leader(message)
             case _:
                 pass
+
+    def _on_leader(self, heartbeat: Heartbeat) -> None:
+        """Let vehicles send their states at once to a coordinator that begins to lead."""
+        leader = heartbeat.coordinator, heartbeat.incarnation, heartbeat.term
+        if heartbeat.leading and leader != self._leader:
+            self._leader = leader
+            self.road.disturb()
 
     def _on_command(self, command: Command, now_s: float) -> list[Effect]:
         # A late answer was computed for a past state and would lead to a wrong position.

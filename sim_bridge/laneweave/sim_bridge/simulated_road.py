@@ -120,12 +120,14 @@ class SimulatedRoad(Generic[VehicleT]):
         had_caretaker = name in self.caretakers
         if self.caretakers.register_command(vehicle, command):
             effects.append(self.sense_of(vehicle))
+        if not command.undisturbed_ticks:
+            vehicle.sense_rate.disturb()
         if not in_time:
             if command.tick < self.tick and incarnation == in_charge:
                 self.answers.late(name)
             return effects
         try:
-            effects += self.caretakers.accept_command(vehicle, command)
+            effects += self._accept(vehicle, command)
         except BadInputError as error:
             log.warning("command ignored", vehicle=name, reason=str(error))
             return effects
@@ -136,6 +138,16 @@ class SimulatedRoad(Generic[VehicleT]):
             previous = "caretaker" if had_caretaker else "agent"
             self._record.on_agent_took_over(self.t_s, name, previous)
         return effects
+
+    def _accept(self, vehicle: VehicleT, command: Command) -> Iterator[Effect]:
+        accepted = yield from self.caretakers.accept_command(vehicle, command)
+        if accepted and command.undisturbed_ticks:
+            vehicle.hold(command)
+
+    def disturb(self) -> None:
+        """Let all vehicles get a SENSE in the next tick: a new leader waits for their states."""
+        for vehicle in self.vehicles.values():
+            vehicle.sense_rate.disturb()
 
     def sense_of(self, vehicle: RoadVehicle) -> Effect:
         """Return the SENSE of a vehicle in the current tick."""
@@ -176,12 +188,15 @@ class SimulatedRoad(Generic[VehicleT]):
         self._roadside.assign_empty_cells(self.vehicles)
         yield from self._roadside.publish(self.tick, self.t_s, self.vehicles.values())
         yield from self._start_caretakers(now_s)
+        sensed = list[Name]()
         for vehicle in self.vehicles.values():
             vehicle.controller.end_move(self.t_s)
-            yield self.sense_of(vehicle)
+            if vehicle.needs_sense(self.tick):
+                sensed.append(vehicle.name)
+                yield self.sense_of(vehicle)
         yield from self.caretakers.states(self.tick)
         yield from self.caretakers.notify_departed(self.tick)
-        self.caretakers.start_tick(self.vehicles, now_s)
+        self.answers.start_tick(sensed, now_s, link_up=self.caretakers.link_up)
 
     def _close_formations(self) -> None:
         for closed in self._roadside.close_formations(self.t_s):

@@ -48,6 +48,8 @@ class Drive:
     jerks: bytes
     """Little-endian float32 pairs (along, across) [m/s3], one per tick of the horizon; empty if no
     solution is usable."""
+    free: bool = False
+    """Whether the vehicle is at rest in its cell, and need not yield to anything ahead."""
 
 
 @frozen
@@ -186,10 +188,13 @@ class TrackingDriver:
         end_tick = max(reference.end_tick, tick + 1) if moving else 0
         if reference is self._settling and tick < reference.end_tick:
             end_tick = reference.end_tick  # ready for plans, but still settling
-        ticks = self._ticks if reference.origin != self._goal else 0
+        at_rest = tick >= reference.rest_tick and not moving
+        origin = self._goal if at_rest else reference.origin
+        ticks = self._ticks if origin != self._goal else 0
         return Drive(
-            motion=CurrentMotion(reference.origin, end_tick, ticks),
+            motion=CurrentMotion(origin, end_tick, ticks),
             jerks=result.jerk.astype(_FLOAT32).tobytes() if result.usable else b"",
+            free=at_rest and result.usable and result.on_reference,
         )
 
     def motion(self, tick: int) -> Course | None:

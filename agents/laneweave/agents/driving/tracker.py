@@ -70,6 +70,8 @@ class TrackResult:
     violation: float
     """Maximum violation of a constraint by the solver's solution, before `limited_jerk`, or an
     upper bound of it."""
+    on_reference: bool = True
+    """Whether the jerks follow the reference itself, and not one that replaces it."""
 
 
 class Tracker:
@@ -141,17 +143,19 @@ class Tracker:
         iterations = 0
         error = _error(commanded, target)
         usable = _is_near(error)
+        on_reference = usable and target is window
         if usable:
             jerk = self._regulated(error, target, gaps)
             if jerk is not None:
                 elapsed_ms = (self._stopwatch() - start) * 1e3
-                return TrackResult(jerk, True, 0, elapsed_ms, 0.0)
+                return TrackResult(jerk, True, 0, elapsed_ms, 0.0, on_reference)
             program.write_bounds(
                 error, target.states, target.jerks, target.defect, gaps, holds=target.holds
             )
             result = program.solve(error)
             usable, iterations = result.usable, result.iterations
         if not usable:
+            on_reference = False
             back = self._path_back(commanded, window.states)
             target = self._yielding(commanded, back, gaps)
             error = _error(commanded, target)
@@ -164,7 +168,7 @@ class Tracker:
         else:
             jerk = np.zeros((self._n, 2))
         elapsed_ms = (self._stopwatch() - start) * 1e3
-        return TrackResult(jerk, usable, iterations, elapsed_ms, result.violation)
+        return TrackResult(jerk, usable, iterations, elapsed_ms, result.violation, on_reference)
 
     def rest(self, commanded: State, goal: State) -> TrackResult | None:
         """Return the jerks that keep a vehicle in its cell while no other vehicle is near.

@@ -25,6 +25,8 @@ FleetMembers = str | tuple[str, ...]
 MAX_SHARDS = 10_000
 LOWEST_PACE, HIGHEST_PACE = 0.01, 1000.0
 """Bounds of `runtime.max_pace`."""
+MAX_HOLD_S = 1.0
+"""Maximum time between two messages of a vehicle that holds undisturbed [s]."""
 
 
 @frozen
@@ -168,6 +170,9 @@ class Runtime:
     """Maximum wait at the entrance for a vehicle's agent (wall-clock seconds)."""
     announce_s: float = field(default=6.0, validator=within(0.0, 600.0))
     """Time by which announcements precede arrivals, so that agents can start (road seconds)."""
+    hold_period_ticks: int = field(default=5, validator=within(1, 100))
+    """Ticks between two messages of a vehicle that holds its cell undisturbed, but at most 1 s; 1:
+    it sends and receives in every tick, as all others."""
     max_pace: float = field(default=10.0, validator=within(LOWEST_PACE, HIGHEST_PACE))
     """Maximum road seconds per wall-clock second. Network and planning take wall-clock time, which
     must be short compared with the time between a plan and its start."""
@@ -175,6 +180,11 @@ class Runtime:
     vehicles_per_process: int = field(default=1, validator=within(1, 1000))
     max_road_s: float = field(default=100_000.0, validator=within(1.0, 1e6))
     """Road time after which an incomplete run is stopped and counts as failed."""
+
+    @property
+    def hold_ticks(self) -> int:
+        """Ticks between two messages of a vehicle that holds undisturbed: at most 1 s."""
+        return max(1, min(self.hold_period_ticks, round(MAX_HOLD_S / self.tick_s)))
 
     def bounds(self, incarnation: int) -> Bounds:
         """Return the bounds of numbers that a process with this incarnation receives."""

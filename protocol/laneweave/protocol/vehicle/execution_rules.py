@@ -19,7 +19,7 @@ from laneweave.protocol.vehicle.plan_execution import (
     ExecutionPhase,
     PlanExecution,
 )
-from laneweave.protocol.vehicle.plans import dependencies, plan_problems
+from laneweave.protocol.vehicle.plans import dependencies, followers, plan_problems
 from laneweave.protocol.wire.messages import (
     PendingTransfer,
     Plan,
@@ -51,7 +51,7 @@ def drop_plan(execution: PlanExecution, _: object) -> None:
     """Drop the plan: k = 0; a motion in progress continues, but belongs to no plan."""
     execution.plan = None
     execution.completed = 0
-    execution.needs = ()
+    execution.needs = execution.followers = ()
     execution.moving_in_plan = False
 
 
@@ -112,6 +112,7 @@ def take_plan(execution: PlanExecution, plan: Plan) -> None:
     """Take the plan; derive its dependencies; request storage of the acceptance."""
     execution.plan = plan
     execution.needs = dependencies(plan, execution.vehicle)
+    execution.followers = followers(plan, execution.vehicle)
     execution.transfer = execution.territory.transfer_in(plan, execution.vehicle)
 
 

@@ -88,6 +88,8 @@ class PlanExecution:
     """Whether the current motion is a move of the accepted plan."""
     needs: tuple[Needs, ...] = ()
     """Dependencies of each move of this vehicle."""
+    followers: tuple[int, ...] = ()
+    """Steps of the moves of other vehicles that depend on moves of this one."""
     t_s: float = 0.0
     """Road time of the tick."""
     promise_stored: bool = False
@@ -252,6 +254,19 @@ class PlanExecution:
         if self.phase is not ExecutionPhase.GOING:
             return True
         return self.is_due(t_s + LISTEN_S) and not self.released
+
+    def is_awaited(self, t_s: float, ahead_s: float) -> bool:
+        """Return whether a move is due within a time: of this vehicle, or of one that waits for it.
+
+        Others have heard of the completed moves of this vehicle `LISTEN_S` after theirs are due.
+        """
+        plan = self.plan
+        if plan is None:
+            return False
+        due_s = (plan.t0_s + step * plan.slot_s for step in self.followers)
+        return self.is_due(t_s + ahead_s) or any(
+            one_s - ahead_s <= t_s <= one_s + LISTEN_S for one_s in due_s
+        )
 
     @property
     def next_move(self) -> PlannedMove | None:

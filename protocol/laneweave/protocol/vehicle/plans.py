@@ -36,6 +36,19 @@ def dependencies(plan: Plan, vehicle: Name) -> tuple[Needs, ...]:
     )
 
 
+def followers(plan: Plan, vehicle: Name) -> tuple[int, ...]:
+    """Return the steps in which moves of others begin that depend on moves of a vehicle."""
+    own = [(step, footprint(origin, target)) for step, origin, target in plan.moves[vehicle]]
+    steps = {
+        step
+        for other, moves in plan.moves.items()
+        for step, origin, target in moves
+        if other != vehicle
+        and any(before < step and cells & footprint(origin, target) for before, cells in own)
+    }
+    return tuple(sorted(steps))
+
+
 def plan_problems(plan: Plan) -> list[str]:
     """Return the reasons why a plan cannot be executed safely; empty if it can.
 

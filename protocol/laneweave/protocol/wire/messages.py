@@ -124,7 +124,9 @@ class CurrentMotion(Message, frozen=True):
     end_tick: Int64 = 0
     """Tick at which the motion ends."""
     ticks: Int64 = 0
-    """Duration of a move [ticks]; 0: the vehicle settles in its cell, or holds."""
+    """Duration of a move [ticks]; 0: the vehicle settles in its cell, or holds. From its cell to
+    the same one, without an end: it holds undisturbed, and needs the next SENSE only after so many
+    ticks, if nothing changes."""
 
 
 class Prepare(Message, frozen=True):
@@ -177,7 +179,7 @@ class Plan(Message, frozen=True):
 
 
 class VehicleState(Message, frozen=True):
-    """Vehicle to its formation and the coordinators, every tick and at once on every change.
+    """Vehicle to its formation and the coordinators, after each SENSE and at once on every change.
 
     The state serves as promise, acceptance and progress report. Missing: vehicles that wait for it
     hold. Late or duplicated: harmless to vehicles, since "completed k moves of ballot b" stays
@@ -264,6 +266,9 @@ class Neighbour(Message, frozen=True):
 class Sense(Message, frozen=True):
     """Bridge to one vehicle at each tick: measurements and the state of its motion controller.
 
+    To a vehicle that holds undisturbed only every `runtime.hold_period_ticks`, or when anything
+    changes.
+
     Missing: sent again every `runtime.tick_resend_s` until `runtime.tick_deadline_s`, or at shorter
     intervals while messages are lost; then the vehicle continues its last trajectory. Duplicated:
     the agent repeats its answer. Older than the newest tick of the same bridge, or from an earlier
@@ -310,6 +315,9 @@ class Sense(Message, frozen=True):
 class Command(Message, frozen=True):
     """Agent to the motion controller of its vehicle (in the bridge), in answer to each `Sense`.
 
+    Also sent between ticks, for the last one, when there is something to store or the vehicle no
+    longer holds undisturbed.
+
     A command contains the complete remaining trajectory. Missing: the controller executes its
     stored trajectory, then holds. Duplicated: no effect. Only an answer to the current tick that
     arrives in time is executed; a late answer only ends the agent's silence. From an older
@@ -332,6 +340,16 @@ class Command(Message, frozen=True):
     """To be stored; its end is 0 if the vehicle holds."""
     jerks: bytes
     """Little-endian float32 pairs (along, across) [m/s3], one per tick, from `tick` on."""
+
+    @property
+    def undisturbed_ticks(self) -> int:
+        """Number of ticks after which the vehicle needs the next SENSE; 0: in the next tick.
+
+        It holds undisturbed: its motion leads from its cell to the same cell, and has no end.
+        """
+        motion = self.motion
+        holds = motion.end_tick == 0 and motion.origin == self.hold_cell
+        return motion.ticks if holds else 0
 
 
 class OffLattice(Message, frozen=True):

@@ -150,10 +150,6 @@ class Caretakers:
             case _:
                 pass
 
-    def start_tick(self, vehicles: Mapping[Name, RoadVehicle], now_s: float) -> None:
-        """Start a tick for all vehicles on the road."""
-        self.answers.start_tick(vehicles, now_s, link_up=self.link_up)
-
     def register_command(self, vehicle: RoadVehicle, command: Command) -> bool:
         """Register a COMMAND as a sign of life, and store its requests in the controller.
 

@@ -27,6 +27,8 @@ class MessageLoss:
     """SENSE messages to each awaited agent since the current tick started."""
     received: Counter[Name] = field(factory=Counter)
     """Answers to any tick from each agent since the current tick started."""
+    _names_last: frozenset[Name] = frozenset()
+    """Agents that were asked in the last tick: some get no SENSE in this one, but answer it now."""
     _asked_last: int = 0
     """SENSE messages in the last tick to agents that answered any."""
     _asked_before: float = 0.0
@@ -46,9 +48,11 @@ class MessageLoss:
 
     def start_tick(self) -> None:
         """Compare the answers with the SENSE messages of one tick before: some arrive late."""
-        received = sum(count for name, count in self.received.items() if name in self.asked)
+        names = self._names_last | self.asked.keys()
+        received = sum(count for name, count in self.received.items() if name in names)
         self._asked_before = _MEMORY * self._asked_before + self._asked_last
         self._received_before = _MEMORY * self._received_before + received
+        self._names_last = frozenset(self.asked)
         self._asked_last = sum(self.asked[name] for name in self.received)
         self.asked.clear()
         self.received.clear()

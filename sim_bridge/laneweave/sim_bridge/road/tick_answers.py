@@ -172,15 +172,15 @@ class Answers:
         self._without_message.clear()
         return fallen_silent
 
-    def start_tick(self, on_road: Iterable[Name], now_s: float, *, link_up: bool) -> None:
+    def start_tick(self, sensed: Iterable[Name], now_s: float, *, link_up: bool) -> None:
         """Start a tick.
 
         Args:
-            on_road: all vehicles on the road, which receive the tick.
+            sensed: the vehicles that get a SENSE in this tick.
             now_s: the node's clock.
             link_up: whether the bridge is connected; otherwise no agent can answer.
         """
-        self._without_message = {name for name in on_road if name in self.up} if link_up else set()
+        self._without_message = {name for name in sensed if name in self.up} if link_up else set()
         self._without_answer = set(self._without_message)
         self._any_message = False
         self.awaited = set() if self.all_silent else self._without_message - self.silent

@@ -5,15 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Self
 
-from attrs import define, evolve
+from attrs import define, evolve, field
 
 from laneweave.protocol.lattice import Cell
+from laneweave.protocol.scenario.deployment_fields import MAX_HOLD_S
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.vehicle_tables import Vehicle
 from laneweave.protocol.vehicle.lane_ends import SOON_S, LaneEnds
 from laneweave.protocol.vehicle.motion import State, cell_state
 from laneweave.protocol.vehicle.sudden_stops import stopping_m
-from laneweave.protocol.wire.messages import ClosedFormation, CurrentMotion, Name, Sense
+from laneweave.protocol.wire.messages import ClosedFormation, Command, CurrentMotion, Name, Sense
 from laneweave.sim_bridge.bodies.command_checks import NEIGHBOURING
 from laneweave.sim_bridge.bodies.motion_controller import (
     FallbackLevel,
@@ -25,6 +26,7 @@ from laneweave.sim_bridge.bodies.plant import Plant
 from laneweave.sim_bridge.bodies.sensors import Sensors
 from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.road.entry import Admission
+from laneweave.sim_bridge.road.sense_rate import SenseRate, Situation
 
 NEAR_M = 0.01
 """Distance from its cell up to which an entering vehicle need not settle."""
@@ -48,6 +50,7 @@ class RoadVehicle:
     ready_s: float = 0.0
     """Road time from which a vehicle that has entered more slowly than v_F is in its cell, or
     almost [s]."""
+    sense_rate: SenseRate = field(factory=SenseRate)
 
     @classmethod
     def entering(
@@ -158,6 +161,7 @@ class RoadVehicle:
         """
         controller, lines = self.controller, self.controller.stop_lines
         before, lines.lane_ends = lines.lane_ends, lane_ends
+        self.sense_rate.disturb()
         origin, target = controller.motion.origin, controller.hold_cell
         return (
             self.has_cell
@@ -175,6 +179,7 @@ class RoadVehicle:
     def join(self, closed: ClosedFormation) -> None:
         """Join a closed formation: plans must cover all of its blocks."""
         self.formation = closed.first_block
+        self.sense_rate.disturb()  # its leader waits for a state of each member
         self.controller.store.join(closed.blocks)
 
     @property
@@ -231,6 +236,33 @@ class RoadVehicle:
             off_lattice=controller.off_lattice is not None,
             vehicle_type=Name(self.arrival.vehicle_type),
         )
+
+    @property
+    def _situation(self) -> Situation:
+        controller = self.controller
+        return Situation.of(
+            controller.record, controller.hold_cell, controller.motion, controller.neighbours
+        )
+
+    def hold(self, command: Command) -> None:
+        """Register that the vehicle holds undisturbed, as its agent has said in a COMMAND."""
+        most_ticks = round(MAX_HOLD_S / self.controller.tick_s)
+        until_tick = command.tick + min(command.undisturbed_ticks, most_ticks)
+        self.sense_rate.hold(self._situation, until_tick)
+
+    def needs_sense(self, tick: int) -> bool:
+        """Return whether the vehicle gets a SENSE in a tick; see `sense_rate`."""
+        rate, controller = self.sense_rate, self.controller
+        if rate.full:
+            return True
+        if (
+            controller.off_lattice is not None
+            or controller.level > FallbackLevel.HOLD
+            or not controller.has_settled(tick * controller.tick_s)
+        ):
+            rate.disturb()
+            return True
+        return rate.is_due(self._situation, tick)
 
     def enter_lattice(self, cells: Sequence[Cell]) -> None:
         """Enter the lattice again: the roadside assigns cells, among them the hold cell."""

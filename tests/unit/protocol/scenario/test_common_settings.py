@@ -53,6 +53,7 @@ SINGLE_ROLE_FIELDS = {
     "runtime.agent_silent_s": "bridge",
     "runtime.agent_start_s": "bridge",
     "runtime.announce_s": "bridge",
+    "runtime.hold_period_ticks": "agent",
     "runtime.coordinators": "launcher, router",
     "runtime.vehicles_per_process": "launcher",
 }

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from laneweave.protocol.lattice import Cell, PlannedMove
-from laneweave.protocol.vehicle.plans import dependencies, plan_problems
+from laneweave.protocol.vehicle.plans import dependencies, followers, plan_problems
 from laneweave.protocol.wire.messages import Name, Plan
 from support.examples import examples
 from support.states import make_plan
@@ -113,6 +113,19 @@ def test_dependencies_are_those_of_the_definition(plan: Plan) -> None:
                 other: needs_in_words(plan, own, other) for other in plan.roster if other != vehicle
             }
             assert found == {other: count for other, count in expected.items() if count}
+
+
+@examples(150)
+@given(VALID_PLANS | ANY_PLANS)
+def test_the_steps_of_followers_are_those_of_moves_that_depend_on_the_vehicle(plan: Plan) -> None:
+    for vehicle in plan.roster:
+        expected = {
+            move[0]
+            for other in plan.roster
+            for move, needs in zip(plan.moves[other], dependencies(plan, other), strict=True)
+            if vehicle in needs
+        }
+        assert followers(plan, vehicle) == tuple(sorted(expected))
 
 
 @examples(100)

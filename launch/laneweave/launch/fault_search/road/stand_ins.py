@@ -68,7 +68,7 @@ class LightDriver:
     def drive(self, sense: Sense, *, moving: bool) -> Drive:
         """Return a command with the end of the current motion, and without jerks."""
         end_tick = max(self._end_tick, sense.tick + 1) if moving else 0
-        return Drive(CurrentMotion(self._origin, end_tick, self._ticks), b"")
+        return Drive(CurrentMotion(self._origin, end_tick, self._ticks), b"", free=not moving)
 
     def motion(self, tick: int) -> None:
         """Publish no motion; motions would only slow down the search."""

@@ -79,7 +79,7 @@ def test_a_network_that_was_broken_becomes_whole(world: FaultRun, kind: str) -> 
     network = world.network
     dropped = network.dropped
     harm(world, kind)
-    network.run(network.now_s + 0.3)
+    network.run(network.now_s + 0.6)  # a vehicle that holds is silent for half a second
     assert network.dropped > dropped
     world.faults.heal()
     network.run(network.now_s + 1.0)

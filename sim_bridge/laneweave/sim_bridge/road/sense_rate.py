@@ -1,0 +1,90 @@
+"""When a vehicle gets its next SENSE.
+
+A vehicle gets a SENSE in every tick, unless its agent has answered the last one that it holds its
+cell undisturbed (`Command.undisturbed_ticks`). Then the next one follows after so many ticks, or in
+the tick in which anything has changed: what the motion controller stores, how it drives, or a
+vehicle in the same lane. Nothing that is safe depends on this: a vehicle without SENSE holds its
+cell, and its motion controller brakes on its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from attrs import define, frozen
+
+from laneweave.protocol.lattice import Cell
+from laneweave.protocol.wire.messages import CurrentMotion, VehicleRecord
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import Neighbours
+
+NEAR_M = 0.5
+"""Change of the gap to a vehicle in the same lane from which the next SENSE does not wait."""
+
+
+@frozen
+class Situation:
+    """What is around a vehicle that holds, as far as it may disturb it."""
+
+    record: VehicleRecord
+    cell: Cell
+    motion: CurrentMotion
+    gaps: tuple[tuple[bool, float], ...]
+    """(whether ahead, net gap [m]) of the neighbours in its lane."""
+
+    @classmethod
+    def of(
+        cls, record: VehicleRecord, cell: Cell, motion: CurrentMotion, neighbours: Neighbours
+    ) -> Situation:
+        """Return the situation of a vehicle with some record, cell, motion and neighbours."""
+        return cls(record, cell, motion, tuple(_gaps(neighbours, cell[1])))
+
+    def is_like(self, before: Situation) -> bool:
+        """Return whether nothing has changed but gaps, and these by at most `NEAR_M`."""
+        return (
+            self.record == before.record
+            and self.cell == before.cell
+            and self.motion == before.motion
+            and len(self.gaps) == len(before.gaps)
+            and all(
+                ahead == was_ahead and abs(gap_m - was_m) <= NEAR_M
+                for (ahead, gap_m), (was_ahead, was_m) in zip(self.gaps, before.gaps, strict=True)
+            )
+        )
+
+
+@define
+class SenseRate:
+    """The tick of the next SENSE to one vehicle."""
+
+    _held: Situation | None = None
+    """Situation in which its agent has said that it holds undisturbed; None: it has not."""
+    _until_tick: int = 0
+
+    @property
+    def full(self) -> bool:
+        """Whether the vehicle gets a SENSE in every tick."""
+        return self._held is None
+
+    def hold(self, situation: Situation, until_tick: int) -> None:
+        """Register that the vehicle holds undisturbed, and needs no SENSE before a tick."""
+        self._held, self._until_tick = situation, until_tick
+
+    def disturb(self) -> None:
+        """Let the vehicle get a SENSE in every tick again."""
+        self._held = None
+
+    def is_due(self, situation: Situation, tick: int) -> bool:
+        """Return whether the vehicle gets a SENSE in a tick; if so, also in the following ones."""
+        held = self._held
+        if held is not None and (tick >= self._until_tick or not situation.is_like(held)):
+            self._held = None
+        return self._held is None
+
+
+def _gaps(neighbours: Neighbours, lane: int) -> Iterator[tuple[bool, float]]:
+    for other in neighbours.ahead:
+        if other.lane == lane:
+            yield True, other.gap_m
+    for other in neighbours.behind:
+        if other.lane == lane:
+            yield False, other.gap_m
