@@ -1,12 +1,14 @@
-"""Measure the CPU time of a simulated run, relative to an earlier commit.
+"""Measure how fast runs are, relative to an earlier commit.
 
     python benchmarks/speed_ratio.py [--base COMMIT] [--rounds N] [--operation NAME]
                                      [--volume VEH_PER_LANE_H] [--duration S] [--limit RATIO]
+                                     [--vehicles-per-process N] [--compiled]
 
 Both commits run with the same demand, alternately, each time in a new process with the libraries of
-this interpreter. Imports do not count. Prints the median ratio of the rounds; the exit status is 1
-if it is above the limit. At the default volume, formations are planned without compiled code, which
-the earlier commit would have to compile first.
+this interpreter. A simulated run takes CPU time, without imports; with --vehicles-per-process,
+processes over Zenoh take seconds per second of road time. Prints the median ratio of the rounds;
+the exit status is 1 if it is above the limit. Formations are planned by TAPPA, which needs no
+compiled code; with --compiled by the default solver, which the earlier commit compiles first.
 """
 
 from __future__ import annotations
@@ -32,19 +34,26 @@ import sys, tempfile, time
 import laneweave
 import laneweave.launch.library.runs
 operation, volume, duration = sys.argv[1], float(sys.argv[2]), float(sys.argv[3])
+per_process, compiled = int(sys.argv[4]), int(sys.argv[5])
+more = {"formation__solver": "tappa"} if operation == "formations" and not compiled else {}
+if per_process:
+    more |= {"runtime__vehicles_per_process": per_process, "runtime__max_pace": 20.0}
+else:
+    more |= {"transport": "simulated"}
 with tempfile.TemporaryDirectory() as folder:
     for seconds in (1.0, duration):  # the first run loads what is loaded when it is needed
         began_s = time.process_time()
-        laneweave.run(
+        summary = laneweave.run(
             out=f"{folder}/{seconds}",
-            transport="simulated",
             seed=77,
             demand__volume_veh_per_lane_h=volume,
             demand__duration_s=seconds,
             formation__operation=operation,
-            **({"formation__solver": "tappa"} if operation == "formations" else {}),
+            **more,
         )
         spent_s = time.process_time() - began_s
+        if per_process:
+            spent_s = 1.0 / summary.runtime.real_time_factor
 print(spent_s)
 """
 
@@ -61,11 +70,19 @@ def unpack(commit: str, folder: Path) -> None:
         archive.extractall(folder, filter="data")
 
 
-def cpu_s(folder: Path, arguments: Sequence[str]) -> float:
-    """Return the CPU time of a run with the code in a folder [s]."""
+COMPILE = """
+import sys
+from laneweave.launch.cli.main import main
+sys.argv = ["laneweave", "compile"]
+main()
+"""
+
+
+def output_of(program: str, folder: Path, arguments: Sequence[str] = ()) -> str:
+    """Return what a program prints that runs with the code in a folder."""
     found = os.pathsep.join(str(folder / part) for part in PARTS)
     done = subprocess.run(  # noqa: S603
-        [sys.executable, "-c", PROGRAM, *arguments],
+        [sys.executable, "-c", program, *arguments],
         cwd=folder,
         env=os.environ | {"PYTHONPATH": found, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
         capture_output=True,
@@ -73,7 +90,12 @@ def cpu_s(folder: Path, arguments: Sequence[str]) -> float:
         text=True,
         timeout=LIMIT_S,
     )
-    return float(done.stdout.splitlines()[-1])
+    return done.stdout
+
+
+def spent_s(folder: Path, arguments: Sequence[str]) -> float:
+    """Return the CPU time of a run [s], or the time per second of road time."""
+    return float(output_of(PROGRAM, folder, arguments).splitlines()[-1])
 
 
 def main() -> int:
@@ -85,14 +107,21 @@ def main() -> int:
     parser.add_argument("--volume", default="500")
     parser.add_argument("--duration", default="40")
     parser.add_argument("--limit", type=float, default=1.2)
+    parser.add_argument("--vehicles-per-process", type=int, default=0, metavar="N")
+    parser.add_argument("--compiled", action="store_true")
     options = parser.parse_args()
-    run = options.operation, options.volume, options.duration
+    per_process, compiled = options.vehicles_per_process, options.compiled
+    demand = options.operation, options.volume, options.duration
+    run = *demand, str(per_process), str(int(compiled))
     with tempfile.TemporaryDirectory() as base:
         unpack(options.base, Path(base))
-        pairs = [(cpu_s(Path(base), run), cpu_s(ROOT, run)) for _ in range(options.rounds)]
+        if compiled:
+            output_of(COMPILE, Path(base))
+        pairs = [(spent_s(Path(base), run), spent_s(ROOT, run)) for _ in range(options.rounds)]
     ratio = statistics.median(now / before for before, now in pairs)
-    each = ", ".join(f"{now:.2f} / {before:.2f} s" for before, now in pairs)
-    print(f"{ratio:.3f} of the CPU time of {options.base} ({each})")  # noqa: T201
+    each = ", ".join(f"{now:.3f} / {before:.3f} s" for before, now in pairs)
+    what = "time per second of road time" if per_process else "CPU time"
+    print(f"{ratio:.3f} of the {what} of {options.base} ({each})")  # noqa: T201
     return int(ratio > options.limit)
 
 

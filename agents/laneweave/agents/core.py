@@ -41,6 +41,7 @@ from laneweave.protocol.runtime.node import (
     Unlisten,
     Withdraw,
 )
+from laneweave.protocol.scenario.deployment_fields import MAX_HOLD_S
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.vehicle_tables import Vehicle
 from laneweave.protocol.state_machine import RuleBook
@@ -63,7 +64,7 @@ from laneweave.protocol.wire.messages import (
     VehicleRecord,
     VehicleState,
 )
-from laneweave.protocol.wire.newest import NewestRoad
+from laneweave.protocol.wire.newest import FORGET_S, NewestRoad
 from laneweave.protocol.wire.process_messages import Report
 from laneweave.protocol.wire.topics import (
     COMMAND,
@@ -138,7 +139,7 @@ class AgentCore:
         self._lane_ends, self._territory = LaneEnds(scenario), territory_of(scenario)
         self._temporary = NO_PARTS
         self._rules = rules
-        self._hold_watch = HoldWatch(scenario)
+        self._hold_watch = HoldWatch(scenario, vehicle)
         self.wanted_motions: tuple[int, ...] = ()
         """Stretches of columns whose motions are needed now; empty while not in charge."""
         self.wanted_states: tuple[int, ...] = ()
@@ -150,6 +151,8 @@ class AgentCore:
         known then."""
         self._sense: Sense | None = None
         self._command: Command | None = None
+        self._waking = False
+        """Whether the vehicle no longer holds undisturbed, but no SENSE has shown this yet."""
         self._own = {"vehicle": vehicle}
 
     @property
@@ -238,7 +241,7 @@ class AgentCore:
                 if execution.on_prepare(message):
                     return [*self._request_storage(execution), self._state()]
             case Plan():
-                if execution.on_plan(message):
+                if execution.on_plan(message) or self._waking:
                     return self._request_storage(execution)
             case _:
                 pass
@@ -255,7 +258,7 @@ class AgentCore:
         t_s = sense.tick * self._scenario.runtime.tick_s
         if not sense.bridge and road.bridge > 0:
             return []
-        if not road.on_message(sense.bridge, t_s, now_s):
+        if not road.on_message(sense.bridge, t_s, now_s, self._forget_s):
             return []
         if road.number != number and self._sense is not None:
             self._forget_road()
@@ -268,7 +271,7 @@ class AgentCore:
         if self._sense is None:
             self._set_type(sense.vehicle_type)
         drove = self.in_charge and self._sense is not None and not self._sense.off_lattice
-        self._sense = sense
+        self._sense, self._waking = sense, False
         # Clocks of different machines may give a caretaker the same incarnation.
         incarnation = sense.record.incarnation
         taken = sense.caretaker and incarnation == self._claim.incarnation
@@ -391,9 +394,19 @@ class AgentCore:
         """
         command = self._command
         assert command is not None  # noqa: S101 (in charge: it has sent one)
-        motion = CurrentMotion(command.hold_cell) if command.undisturbed_ticks else command.motion
+        motion = command.motion
+        if command.undisturbed_ticks:
+            motion, self._waking = CurrentMotion(command.hold_cell), True
         self._command = replace(command, record=execution.wanted, motion=motion)
-        return [Send(COMMAND, self._command, self._own)] if self._command != command else []
+        if self._command == command and not self._waking:
+            return []
+        return [Send(COMMAND, self._command, self._own)]
+
+    @property
+    def _forget_s(self) -> float:
+        """Time after which a newer road is forgotten: longer while it need not send anything."""
+        resting = self._command is not None and self._command.undisturbed_ticks > 0
+        return FORGET_S + 2.0 * MAX_HOLD_S if resting else FORGET_S
 
     def _forget_road(self) -> None:
         """Discard the state of an earlier bridge's vehicle, as after a restart (V1)."""

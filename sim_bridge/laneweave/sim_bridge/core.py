@@ -283,7 +283,7 @@ class BridgeCore:
         )
 
     def _on_event(self, event: Event, now_s: float) -> Iterator[Effect]:
-        self.road.caretakers.on_network(event, now_s)
+        self.road.on_network(event, now_s)
         self._deployment.on_event(event, self.t_s, now_s)
         match event:
             case Started():
@@ -327,16 +327,16 @@ class BridgeCore:
             case Heartbeat():
                 self.road.bounds.check(message, self.t_s, now_s)
                 self._record.on_heartbeat(message, self.t_s, now_s)
-                self._on_leader(message)
+                yield from self._on_leader(message)
             case _:
                 pass
 
-    def _on_leader(self, heartbeat: Heartbeat) -> None:
+    def _on_leader(self, heartbeat: Heartbeat) -> Iterator[Effect]:
         """Let vehicles send their states at once to a coordinator that begins to lead."""
         leader = heartbeat.coordinator, heartbeat.incarnation, heartbeat.term
         if heartbeat.leading and leader != self._leader:
             self._leader = leader
-            self.road.disturb()
+            yield from self.road.disturb()
 
     def _on_command(self, command: Command, now_s: float) -> list[Effect]:
         # A late answer was computed for a past state and would lead to a wrong position.

@@ -16,7 +16,15 @@ import structlog
 
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.road_layout import Exits
-from laneweave.protocol.runtime.node import Announce, Effect, Listen, Send, Watch
+from laneweave.protocol.runtime.node import (
+    Announce,
+    Effect,
+    Event,
+    Listen,
+    PeerUp,
+    Send,
+    Watch,
+)
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.wire.bounds import check_ballot
 from laneweave.protocol.wire.events import AGENT_SILENT
@@ -96,6 +104,14 @@ class SimulatedRoad(Generic[VehicleT]):
         yield Watch(VEHICLE_ALIVE)
         yield Announce(BRIDGE_ALIVE, {"incarnation": self.incarnation})
 
+    def on_network(self, event: Event, now_s: float) -> None:
+        """Handle agents' tokens and the state of the bridge's connection; ignore other events."""
+        self.caretakers.on_network(event, now_s)
+        if isinstance(event, PeerUp) and event.topic is VEHICLE_ALIVE:
+            vehicle = self.vehicles.get(Name(event.parameters["vehicle"]))
+            if vehicle is not None:
+                vehicle.sense_rate.disturb()  # perhaps another process
+
     def on_ballot(self, vehicle: Name, message: Prepare | Plan) -> Iterator[Effect]:
         """Pass a message of a leader to the vehicle's caretaker."""
         check_ballot(message.ballot, self.t_s)
@@ -140,14 +156,18 @@ class SimulatedRoad(Generic[VehicleT]):
         return effects
 
     def _accept(self, vehicle: VehicleT, command: Command) -> Iterator[Effect]:
+        in_charge = vehicle.controller.record.incarnation
         accepted = yield from self.caretakers.accept_command(vehicle, command)
-        if accepted and command.undisturbed_ticks:
+        claimed = vehicle.controller.record.incarnation != in_charge
+        if accepted and command.undisturbed_ticks and not claimed:
             vehicle.hold(command)
 
-    def disturb(self) -> None:
-        """Let all vehicles get a SENSE in the next tick: a new leader waits for their states."""
+    def disturb(self) -> Iterator[Effect]:
+        """Send SENSE to the vehicles that hold undisturbed: a new leader waits for their states."""
         for vehicle in self.vehicles.values():
-            vehicle.sense_rate.disturb()
+            if not vehicle.sense_rate.full:
+                vehicle.sense_rate.disturb()
+                yield self.sense_of(vehicle)
 
     def sense_of(self, vehicle: RoadVehicle) -> Effect:
         """Return the SENSE of a vehicle in the current tick."""
@@ -196,7 +216,9 @@ class SimulatedRoad(Generic[VehicleT]):
                 yield self.sense_of(vehicle)
         yield from self.caretakers.states(self.tick)
         yield from self.caretakers.notify_departed(self.tick)
-        self.answers.start_tick(sensed, now_s, link_up=self.caretakers.link_up)
+        all_sensed = len(sensed) == len(self.vehicles)
+        link_up = self.caretakers.link_up
+        self.answers.start_tick(sensed, now_s, link_up=link_up, all_sensed=all_sensed)
 
     def _close_formations(self) -> None:
         for closed in self._roadside.close_formations(self.t_s):

@@ -100,6 +100,22 @@ def test_older_ticks_and_other_vehicles_are_ignored() -> None:
     assert rig.run().t_s == pytest.approx((rig.tick - 1) * TICK_S)
 
 
+def test_a_body_that_is_pushed_out_of_the_cell_of_its_last_move_drives_back() -> None:
+    """V8: that motion begins in the cell, not where the move began, and is accepted."""
+    rig = up_and_running()
+    rig.accept((0, HOME, (-1, 2)))
+    rig.run(2 * MOVE_TICKS)
+    assert rig.controller.hold_cell == (-1, 2)
+    s, *others = rig.state
+    rig.controller.plant._state = (s - 1.5, *others)  # type: ignore[assignment]
+    assert rig.run().moving
+    assert rig.played is not None
+    assert rig.played.motion.origin == (-1, 2)
+    rig.run(80)  # each command is accepted
+    assert not rig.shown[-1].moving
+    assert rig.off((-1, 2)) < ARRIVED_ALONG_M
+
+
 def test_an_agent_starts_anew_on_the_road_of_a_newer_bridge() -> None:
     rig = up_and_running()
     rig.accept((0, HOME, (-1, 2)))

@@ -49,7 +49,7 @@ class Drive:
     """Little-endian float32 pairs (along, across) [m/s3], one per tick of the horizon; empty if no
     solution is usable."""
     free: bool = False
-    """Whether the vehicle is at rest in its cell, and need not yield to anything ahead."""
+    """Whether the vehicle is at rest in its cell, and follows its own reference."""
 
 
 @frozen
@@ -116,6 +116,8 @@ class TrackingDriver:
         self._reference: Reference | None = None
         self._settling: Reference | None = None
         """The reference with which the vehicle settles in the cell in which it has entered."""
+        self._origin: Cell = (0, 0)
+        """Cell in which the newest motion began; from its end on the goal."""
         self._goal: Cell = (0, 0)
         self._durations = scenario.timing.move_durations
         self._ticks = 0
@@ -135,7 +137,8 @@ class TrackingDriver:
 
     def take_over(self, sense: Sense) -> None:
         """Continue the motion controller's current motion."""
-        self._goal, self._settling, motion = sense.hold_cell, None, sense.motion
+        self._origin = self._goal = sense.hold_cell
+        self._settling, motion = None, sense.motion
         if motion.origin == sense.hold_cell and motion.end_tick > sense.tick + 3:
             commanded = self._commanded(sense)
             self._reference = self._settling = Reference.settling(
@@ -153,7 +156,7 @@ class TrackingDriver:
         # The same move may begin again, if the command with its beginning was lost.
         if self._settling is not None and self._settling.origin == move[1]:
             self._reference.settle_meanwhile(self._settling)
-        self._goal, self._ticks = move[2], ticks
+        self._origin, self._goal, self._ticks = move[1], move[2], ticks
 
     def at_rest(self, sense: Sense) -> bool:
         """Return whether the motion's time has passed and the body has arrived.
@@ -189,10 +192,11 @@ class TrackingDriver:
         if reference is self._settling and tick < reference.end_tick:
             end_tick = reference.end_tick  # ready for plans, but still settling
         at_rest = tick >= reference.rest_tick and not moving
-        origin = self._goal if at_rest else reference.origin
-        ticks = self._ticks if origin != self._goal else 0
+        if at_rest:
+            self._origin = self._goal
+        ticks = self._ticks if self._origin != self._goal else 0
         return Drive(
-            motion=CurrentMotion(origin, end_tick, ticks),
+            motion=CurrentMotion(self._origin, end_tick, ticks),
             jerks=result.jerk.astype(_FLOAT32).tobytes() if result.usable else b"",
             free=at_rest and result.usable and result.on_reference,
         )

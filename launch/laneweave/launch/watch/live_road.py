@@ -47,7 +47,7 @@ from laneweave.protocol.wire.topics import (
 
 TOPICS = (STATE, CLOCK, CENSUS, OBSTACLES, HEARTBEAT, PLAN, EVENT, ROAD_STATUS, SETTINGS)
 """Subscribed topics, most frequent first."""
-UNHEARD_S = 1.0
+UNHEARD_S = 2.0
 """Age (road time) of the newest state above which a vehicle counts as not heard from."""
 STILL_S = 2.0
 """Age (wall-clock time) of the newest clock message above which the clock counts as stopped."""

@@ -21,7 +21,7 @@ AHEAD_S = 10.0
 
 @define
 class Newest:
-    """The newest value, which is forgotten if only lower ones arrive for `FORGET_S`."""
+    """The newest value, which is forgotten if only lower ones arrive for `FORGET_S`, or longer."""
 
     value: Any = None
     """None: no value yet."""
@@ -30,12 +30,19 @@ class Newest:
     _refused_since_s: float | None = None
     """Time of the first other value since then."""
 
-    def take(self, value: Any, now_s: float, *, ahead: bool = False) -> bool:  # noqa: ANN401
+    def take(
+        self,
+        value: Any,  # noqa: ANN401
+        now_s: float,
+        *,
+        ahead: bool = False,
+        forget_s: float = FORGET_S,
+    ) -> bool:
         """Take a value unless it is late or too far `ahead`; return whether it is the newest."""
         if self.value is not None and (ahead or value < self.value):
             if self._refused_since_s is None:
                 self._refused_since_s = now_s
-            if now_s < self._refused_since_s + FORGET_S:
+            if now_s < self._refused_since_s + forget_s:
                 return False
         self.value, self.shown_s, self._refused_since_s = value, now_s, None
         return True
@@ -89,21 +96,22 @@ class NewestRoad:
         """Forget all tokens: they are shown again when the connection is restored."""
         self._tokens.clear()
 
-    def on_message(self, bridge: int, t_s: float, now_s: float) -> bool:
+    def on_message(self, bridge: int, t_s: float, now_s: float, forget_s: float = FORGET_S) -> bool:
         """Register a message of a bridge; return whether it is of the newest road.
 
         Args:
             bridge: incarnation of the bridge that sent the message; 0: not given.
             t_s: road time of the message [s].
             now_s: the node's clock.
+            forget_s: time after which a newer road is forgotten if it sends nothing.
 
         Raises:
             BadInputError: the road time is later than possible.
         """
-        if bridge and not self._take_bridge(bridge, now_s):
+        if bridge and not self._take_bridge(bridge, now_s, forget_s):
             return False
         latest_s, before_s = self.latest_s(now_s), self.t_s
-        if not self._time.take(t_s, now_s, ahead=t_s > latest_s):
+        if not self._time.take(t_s, now_s, ahead=t_s > latest_s, forget_s=forget_s):
             if t_s > latest_s:
                 raise BadInputError("t_s", t_s, f"at most {latest_s:g}")
             return True  # late
@@ -111,9 +119,9 @@ class NewestRoad:
             self.number += 1
         return True
 
-    def _take_bridge(self, bridge: int, now_s: float) -> bool:
+    def _take_bridge(self, bridge: int, now_s: float, forget_s: float = FORGET_S) -> bool:
         before = self.bridge
-        if not self._bridge.take(bridge, now_s):
+        if not self._bridge.take(bridge, now_s, forget_s=forget_s):
             return False
         if bridge != before:
             self.number += 1

@@ -9,16 +9,15 @@ cell, and its motion controller brakes on its own.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 from attrs import define, frozen
 
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.wire.messages import CurrentMotion, VehicleRecord
+from laneweave.protocol.wire.messages import CurrentMotion, Neighbour, VehicleRecord
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import Neighbours
 
-NEAR_M = 0.5
-"""Change of the gap to a vehicle in the same lane from which the next SENSE does not wait."""
+GAP_M, SPEED_MPS, ACCEL_MPS2 = 0.5, 0.3, 1.5
+"""Changes of the gap to a vehicle in the same lane, of its speed and its acceleration from which
+the next SENSE does not wait."""
 
 
 @frozen
@@ -28,27 +27,29 @@ class Situation:
     record: VehicleRecord
     cell: Cell
     motion: CurrentMotion
-    gaps: tuple[tuple[bool, float], ...]
-    """(whether ahead, net gap [m]) of the neighbours in its lane."""
+    ahead: tuple[Neighbour, ...]
+    """Those in its lane."""
+    behind: tuple[Neighbour, ...]
+    """Those in its lane."""
 
     @classmethod
     def of(
         cls, record: VehicleRecord, cell: Cell, motion: CurrentMotion, neighbours: Neighbours
     ) -> Situation:
         """Return the situation of a vehicle with some record, cell, motion and neighbours."""
-        return cls(record, cell, motion, tuple(_gaps(neighbours, cell[1])))
+        ahead, behind = (
+            tuple(other for other in others if other.lane == cell[1]) for others in neighbours
+        )
+        return cls(record, cell, motion, ahead, behind)
 
     def is_like(self, before: Situation) -> bool:
-        """Return whether nothing has changed but gaps, and these by at most `NEAR_M`."""
+        """Return whether nothing has changed but measurements, and these only a little."""
         return (
             self.record == before.record
             and self.cell == before.cell
             and self.motion == before.motion
-            and len(self.gaps) == len(before.gaps)
-            and all(
-                ahead == was_ahead and abs(gap_m - was_m) <= NEAR_M
-                for (ahead, gap_m), (was_ahead, was_m) in zip(self.gaps, before.gaps, strict=True)
-            )
+            and _are_like(self.ahead, before.ahead)
+            and _are_like(self.behind, before.behind)
         )
 
 
@@ -81,10 +82,10 @@ class SenseRate:
         return self._held is None
 
 
-def _gaps(neighbours: Neighbours, lane: int) -> Iterator[tuple[bool, float]]:
-    for other in neighbours.ahead:
-        if other.lane == lane:
-            yield True, other.gap_m
-    for other in neighbours.behind:
-        if other.lane == lane:
-            yield False, other.gap_m
+def _are_like(now: tuple[Neighbour, ...], before: tuple[Neighbour, ...]) -> bool:
+    return len(now) == len(before) and all(
+        abs(one.gap_m - was.gap_m) <= GAP_M
+        and abs(one.speed_mps - was.speed_mps) <= SPEED_MPS
+        and abs(one.accel_mps2 - was.accel_mps2) <= ACCEL_MPS2
+        for one, was in zip(now, before, strict=True)
+    )

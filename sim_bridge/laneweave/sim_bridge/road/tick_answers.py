@@ -31,7 +31,7 @@ MAX_SLOWDOWN = 8.0
 _SLOW_DOWN, _RELAX = 1.5, 0.98
 """Multipliers of the deadline's factor after ticks with too many late answers, and after others."""
 _LATE_AGENTS = 0.05
-"""Fraction of agents that may be late before the deadline is increased."""
+"""Fraction of the agents that a tick awaits that may be late before the deadline is increased."""
 _LATE_AGENTS_LOSSY = 1.0 / 3.0
 """The same while messages are lost: ticks then end while answers to repeated SENSE are under way,
 so some agents are late on a fast machine, too."""
@@ -81,6 +81,10 @@ class Answers:
     _late: set[Name] = field(factory=set)
     """Agents that have answered an earlier tick since the current tick started."""
     _slowdown: float = 1.0
+    _asked: int = 0
+    """Number of agents whose answers the last tick awaited."""
+    _all_sensed: bool = True
+    """Whether all vehicles on the road have got a SENSE in the current tick."""
     _any_message: bool = False
     _all_silent_s: float = 0.0
     """Total duration of ticks since the last message from any agent."""
@@ -167,25 +171,30 @@ class Answers:
             if name not in self.silent and self._too_long(self._silence_s[name]):
                 self.silent.add(name)
                 fallen_silent.append(name)
-        if self._without_message and not self._any_message:
+        if self._without_message and not self._any_message and self._all_sensed:
             self._all_silent_s += lasted_s
         self._without_message.clear()
         return fallen_silent
 
-    def start_tick(self, sensed: Iterable[Name], now_s: float, *, link_up: bool) -> None:
+    def start_tick(
+        self, sensed: Iterable[Name], now_s: float, *, link_up: bool, all_sensed: bool = True
+    ) -> None:
         """Start a tick.
 
         Args:
             sensed: the vehicles that get a SENSE in this tick.
             now_s: the node's clock.
             link_up: whether the bridge is connected; otherwise no agent can answer.
+            all_sensed: whether these are all vehicles on the road; the others hold undisturbed.
         """
+        self._all_sensed = all_sensed
         self._without_message = {name for name in sensed if name in self.up} if link_up else set()
         self._without_answer = set(self._without_message)
         self._any_message = False
         self.awaited = set() if self.all_silent else self._without_message - self.silent
         share = _LATE_AGENTS_LOSSY if self.lossy else _LATE_AGENTS
-        slow = len(self._late) > share * len(self.up)
+        slow = len(self._late) > share * self._asked
+        self._asked = len(self.awaited)
         self._slowdown *= _SLOW_DOWN if slow else _RELAX
         self._slowdown = min(max(self._slowdown, 1.0), MAX_SLOWDOWN)
         self._late.clear()

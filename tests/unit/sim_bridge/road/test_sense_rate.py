@@ -23,7 +23,7 @@ from laneweave.protocol.wire.topics import HEARTBEAT
 from laneweave.sim_bridge.bodies.command_checks import MAX_MOTION_TICKS
 from laneweave.sim_bridge.bodies.motion_controller import FallbackLevel, OffLatticePhase
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import NO_NEIGHBOURS, Neighbours
-from laneweave.sim_bridge.road.sense_rate import NEAR_M
+from laneweave.sim_bridge.road.sense_rate import ACCEL_MPS2, GAP_M, SPEED_MPS
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
 from support.bridge_bench import ROAD, TWO, A, B, Desk, asked, make_scenario
 
@@ -153,35 +153,50 @@ def test_any_change_of_the_vehicle_ends_the_rest(
 
 @pytest.mark.parametrize("behind", [False, True])
 def test_a_neighbour_in_the_lane_that_moves_ends_the_rest(desk: Desk, *, behind: bool) -> None:
-    vehicle = desk.core.vehicles[A]
+    vehicle, tick = desk.core.vehicles[A], desk.core.tick
     controller, lane = vehicle.controller, vehicle.cell[1]
+    rest = desk.command(A, motion=CurrentMotion(vehicle.cell, 0, PERIOD))
+    one = Neighbour(lane=lane, gap_m=10.0, speed_mps=15.0)
 
-    def near(gap_m: float, lane: int) -> None:
-        near = (Neighbour(lane=lane, gap_m=gap_m, speed_mps=15.0),)
+    def look(*near: Neighbour) -> None:
         controller.neighbours = Neighbours((), near) if behind else Neighbours(near, ())
 
-    tick = desk.core.tick
-    for gap_m, other, due in [
-        (10.0 + 0.9 * NEAR_M, lane, False),
-        (10.0 + 1.1 * NEAR_M, lane, True),
-        (10.0 - 1.1 * NEAR_M, lane, True),
-        (10.0, lane + 1, True),
-    ]:
-        near(10.0, lane)
-        vehicle.hold(desk.command(A, motion=CurrentMotion(vehicle.cell, 0, PERIOD)))
-        near(gap_m, other)
-        assert vehicle.needs_sense(tick) == due, (gap_m, other)
-    near(10.0, lane + 1)  # in another lane
-    vehicle.hold(desk.command(A, motion=CurrentMotion(vehicle.cell, 0, PERIOD)))
-    near(3.0, lane + 1)
-    assert not vehicle.needs_sense(tick)
+    def is_disturbed(*near: Neighbour) -> bool:
+        look(one)
+        vehicle.hold(rest)
+        look(*near)
+        return vehicle.needs_sense(tick)
+
+    for name, limit in (("gap_m", GAP_M), ("speed_mps", SPEED_MPS), ("accel_mps2", ACCEL_MPS2)):
+        for sign in (-1.0, 1.0):
+            value = getattr(one, name)
+            assert not is_disturbed(replace(one, **{name: value + 0.9 * sign * limit}))
+            assert is_disturbed(replace(one, **{name: value + 1.1 * sign * limit}))
+    assert is_disturbed()
+    assert is_disturbed(one, one)
+    assert is_disturbed(replace(one, lane=lane + 1))
+    assert not is_disturbed(one, replace(one, lane=lane + 1, gap_m=3.0, speed_mps=9.0))
+
+
+def test_another_process_of_the_vehicle_is_asked_in_the_next_tick(desk: Desk) -> None:
+    hold(desk, A)
+    assert next_tick(desk, B) == [B]
+    desk.up(A)
+    assert next_tick(desk, B) == [A, B]
+
+
+def test_a_claim_is_confirmed_in_the_next_tick_whatever_it_says(desk: Desk) -> None:
+    cell = desk.core.vehicles[A].cell
+    desk.answer(A, incarnation=7, motion=CurrentMotion(cell, 0, PERIOD))
+    assert desk.core.vehicles[A].controller.record.incarnation == 7
+    assert next_tick(desk, B) == [A, B]
 
 
 def test_a_coordinator_that_begins_to_lead_gets_the_states_of_all(desk: Desk) -> None:
     hold(desk, A)
     assert next_tick(desk, B) == [B]
     beat = Heartbeat(Name("c2"), 5, 3, leading=True, plans=0)
-    desk.give(Arrived(HEARTBEAT, {"coordinator": "c2"}, beat))
+    assert asked(desk.give(Arrived(HEARTBEAT, {"coordinator": "c2"}, beat))) == [A]  # at once
     assert next_tick(desk, B) == [A, B]
     hold(desk, A)
     desk.give(Arrived(HEARTBEAT, {"coordinator": "c2"}, beat))

@@ -462,3 +462,25 @@ def test_while_messages_are_lost_ticks_get_more_time_if_a_third_is_late(
     usual_s = LOSSY_TICK * TICK_S
     assert (answers.deadline_s - now_s > 1.4 * usual_s) is more_time
     assert answers.deadline_s - now_s >= 0.99 * usual_s
+
+
+def test_a_tick_that_asks_only_a_hanging_agent_is_no_silence_of_all(answers: Answers) -> None:
+    """The others hold undisturbed."""
+    for number in range(2 * TICKS):
+        answers.start_tick((A,), number * DEADLINE_S, link_up=True, all_sensed=False)
+        answers.close()
+        answers.update_durations((number + 1) * DEADLINE_S)
+    assert answers.silent == {A}
+    assert not answers.all_silent
+
+
+def test_late_answers_are_compared_with_those_that_a_tick_awaits(answers: Answers) -> None:
+    many = [Name(f"v{number}") for number in range(100)]
+    for name in many:
+        answers.agent_up(name)
+    for number in range(4):
+        answers.start_tick(many[:10], number * DEADLINE_S, link_up=True, all_sensed=False)
+        answers.close()
+        for name in many[:3]:
+            answers.late(name)
+    assert answers._slowdown > 1.0

@@ -156,7 +156,7 @@ class LightRoad:
 
     def _on_event(self, event: Event, now_s: float) -> Iterator[Effect]:
         road = self._road
-        road.caretakers.on_network(event, now_s)
+        road.on_network(event, now_s)
         match event:
             case Arrived(_, _, Command() as command):
                 yield from self._on_command(command, now_s)
@@ -170,7 +170,7 @@ class LightRoad:
                 yield from self._begin_tick(now_s)
             case Started():
                 # The agents start at the same time.
-                road.caretakers.on_network(LinkUp(), now_s)
+                road.on_network(LinkUp(), now_s)
                 yield from road.connect()
                 yield from self._begin_tick(now_s)
             case _:
