@@ -273,8 +273,9 @@ class Sense(Message, frozen=True):
     intervals while messages are lost; then the vehicle continues its last trajectory. Duplicated:
     the agent repeats its answer. Older than the newest tick of the same bridge, or from an earlier
     bridge: ignored. From a newer bridge, or if only older ones arrive for 0.5 s (2.5 s while it
-    holds undisturbed): the agent discards its state and takes a new incarnation. A message with `left` is repeated for 20 ticks or until
-    the agent's token vanishes; when a run ends, each vehicle on the road receives one.
+    holds undisturbed): the agent discards its state and takes a new incarnation. A message with
+    `left` is repeated for 20 ticks or until the agent's token vanishes; when a run ends, each
+    vehicle on the road receives one.
     """
 
     vehicle: Name
