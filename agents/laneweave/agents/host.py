@@ -56,7 +56,7 @@ class AgentMetrics:
 
     vehicles: int = metric("Vehicles that this process has agents for")
     vehicles_in_charge: int = metric("Vehicles on the road that this process is in charge of")
-    solves_total: int = metric("Tracker solves, one per vehicle per tick")
+    solves_total: int = metric("Tracker solves, one for each SENSE")
     unusable_total: int = metric("Tracker solves without a usable result")
 
 

@@ -1,9 +1,10 @@
 """The live road: observed state of a deployment, and the frames that show it.
 
 A pure core that turns messages and times into frames. Every vehicle publishes its state in each
-tick; until the next state arrives, its position is extrapolated from its speed. After `UNHEARD_S`
-without a state, the vehicle is drawn in its cell and marked: without new information it holds its
-cell, but its position is unknown. If its cell has passed a stop line, it is drawn at that line.
+tick, or less often while it holds; until the next state arrives, its position is extrapolated from
+its speed. After `UNHEARD_S` without a state, the vehicle is drawn in its cell and marked: without
+new information it holds its cell, but its position is unknown. If its cell has passed a stop line,
+it is drawn at that line.
 """
 
 from __future__ import annotations
