@@ -127,7 +127,7 @@ CASES = {
         Reason.NO_LEADER, ("no coordinator led from 10.9 s on",), killed(11.0, *COORDINATORS)
     ),
     "a coordinator leads too late": Case(
-        Reason.LATE_LEADER, ("no leader until 45.0 s", "at 45.0 s it was too late"), LATE_LEADER
+        Reason.LATE_LEADER, ("no leader until 45.1 s", "at 45.3 s it was too late"), LATE_LEADER
     ),
     "the agent dies": Case(
         Reason.NO_AGENT, ("no agent since 20.1 s: its agent is gone",), killed(20.0, "v0004")

@@ -37,6 +37,8 @@ SLOTS_ON_ROAD = 45
 TRUCK = VehicleTypeSettings("truck", 0.3, max_accel_mps2=4.0)
 """A type that cannot change columns in the short slots of the fault search. It has the size of
 cars, since sizes and brakes do not matter to light bodies."""
+HOLD_PERIODS_TICKS = (1, 5)
+"""Values of `runtime.hold_period_ticks` to draw from."""
 STREAM_PLANNER = 0.05
 """Share of runs with the stream planner, which takes ten times as long as the rest of a run."""
 
@@ -67,6 +69,9 @@ class RoadSetup:
     drawn: DrawnRoad = STRAIGHT_ROAD
     """Closed parts, ramps and exits (at the real roadside)."""
     surprises: Surprises = NO_SURPRISES
+    hold_period_ticks: int = 1
+    """Ticks between two messages of a vehicle that holds undisturbed; 1, as in older stories: all
+    get SENSE in every tick."""
 
     def make_scenario(self) -> Scenario:
         """Return the scenario of the road."""
@@ -110,7 +115,9 @@ class RoadSetup:
             vehicle_type=(TRUCK,) if self.trucks else (),
             formation=formation,
             network=Network(heartbeat_s=0.2, election_s=0.6, lease_s=LEASE_S),
-            runtime=Runtime(tick_s=TICK_S, agent_silent_s=1.5),
+            runtime=Runtime(
+                tick_s=TICK_S, agent_silent_s=1.5, hold_period_ticks=self.hold_period_ticks
+            ),
             seed=self.seed,
         )
 

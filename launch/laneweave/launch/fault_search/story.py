@@ -7,10 +7,11 @@ import random
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
-from attrs import frozen
+from attrs import evolve, frozen
 
 from laneweave.launch.fault_search.events.faults import FaultEvent, draw_events
 from laneweave.launch.fault_search.profiles import Profile
+from laneweave.launch.fault_search.road_setup import HOLD_PERIODS_TICKS
 from laneweave.launch.fault_search.setup import Setup
 from laneweave.protocol.config.source_files import (
     SourceFile,
@@ -54,6 +55,8 @@ class Story:
         """Draw the story of a seed from a profile."""
         rng = random.Random(f"{profile.name}/{seed}")  # noqa: S311 (simulation, no secrets)
         setup = Setup.drawn(profile, rng)
+        period_ticks = random.Random(f"rate/{seed}").choice(HOLD_PERIODS_TICKS)  # noqa: S311
+        setup = evolve(setup, road=evolve(setup.road, hold_period_ticks=period_ticks))
         fault_s = setup.lasting.fault_s
         return cls(
             name=f"{profile.name} {seed}",

@@ -15,6 +15,8 @@ from laneweave.protocol.wire.messages import Name
 
 LOSSY_SHARE = 0.9
 """Share of answered SENSE messages below which messages count as lost."""
+_LATE_TICKS = 10
+"""Number of ticks for which answers to a SENSE may arrive."""
 _MEMORY = 0.95
 """Multiplier of the numbers of earlier SENSE messages and answers at each tick."""
 
@@ -27,8 +29,9 @@ class MessageLoss:
     """SENSE messages to each awaited agent since the current tick started."""
     received: Counter[Name] = field(factory=Counter)
     """Answers to any tick from each agent since the current tick started."""
-    _names_last: frozenset[Name] = frozenset()
-    """Agents that were asked in the last tick: some get no SENSE in this one, but answer it now."""
+    _tick: int = 0
+    _asked_in: dict[Name, int] = field(factory=dict)
+    """Tick in which each agent was asked last, for `_LATE_TICKS`."""
     _asked_last: int = 0
     """SENSE messages in the last tick to agents that answered any."""
     _asked_before: float = 0.0
@@ -48,11 +51,14 @@ class MessageLoss:
 
     def start_tick(self) -> None:
         """Compare the answers with the SENSE messages of one tick before: some arrive late."""
-        names = self._names_last | self.asked.keys()
-        received = sum(count for name, count in self.received.items() if name in names)
+        # Vehicles that hold undisturbed get a SENSE now and then, and may answer it ticks later.
+        oldest = self._tick - _LATE_TICKS
+        self._asked_in = {name: tick for name, tick in self._asked_in.items() if tick > oldest}
+        self._asked_in |= dict.fromkeys(self.asked, self._tick)
+        self._tick += 1
+        received = sum(self.received[name] for name in self.received.keys() & self._asked_in.keys())
         self._asked_before = _MEMORY * self._asked_before + self._asked_last
         self._received_before = _MEMORY * self._received_before + received
-        self._names_last = frozenset(self.asked)
         self._asked_last = sum(self.asked[name] for name in self.received)
         self.asked.clear()
         self.received.clear()

@@ -121,13 +121,13 @@ def test_positions_are_extrapolated_between_states() -> None:
 
 def test_a_vehicle_that_is_not_heard_is_shown_in_its_cell_and_marked() -> None:
     road = watched()
-    for tick in range(START + 21, START + 40):
+    for tick in range(START + 21, START + 50):
         road.update(CONVOY.clock(tick), 2.0)
         for number in range(1, 9):
             road.update(CONVOY.state(number, tick), 2.0)
     rows = shown(road)["vehicles"]
     assert [row[8] for row in rows] == [UNHEARD, *[0] * 8]
-    assert rows[0][1] == pytest.approx(CONVOY.state(0, START + 39).s_m, abs=0.01)
+    assert rows[0][1] == pytest.approx(CONVOY.state(0, START + 49).s_m, abs=0.01)
     assert rows[0][7] == 0
     # Never heard at all: the cell in which it entered is all that is known.
     silent = LiveRoad(ROLLING, wall_s=0.0)

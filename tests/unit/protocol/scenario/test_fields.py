@@ -84,7 +84,9 @@ def test_the_file_of_the_paper_holds_the_defaults_but_for_its_formations() -> No
         solver="tappa",
         conflicts=explicit,
     )
-    assert load_scenario(FOLDER / "paper.toml") == attrs.evolve(default, formation=formation)
+    runtime = attrs.evolve(default.runtime, hold_period_ticks=1)
+    expected = attrs.evolve(default, formation=formation, runtime=runtime)
+    assert load_scenario(FOLDER / "paper.toml") == expected
 
 
 def test_the_lattice_is_that_of_the_tables() -> None:
