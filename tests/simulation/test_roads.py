@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from attrs import evolve
 
 from laneweave.launch.fault_search.profiles import PROFILES
 from laneweave.launch.fault_search.search import run_story
@@ -24,14 +25,14 @@ NOTICED: list[tuple[str, Bug, int]] = [
     (ROADS, road_bugs.agents_insist, 56),
     (FORMATIONS, road_bugs.ramps_are_forgotten, 2),
     (FORMATIONS, road_bugs.columns_ahead_are_closed, 66),
-    (LANE_ENDS, road_bugs.never_leaves, 4),
+    (LANE_ENDS, road_bugs.never_leaves, 6),
     (LANE_ENDS, road_bugs.agents_move_vehicles_without_cells, 4),
     (LANE_ENDS, road_bugs.agent_remembers, 4),
     (ROADS, road_bugs.exits_are_closed, 1),
     (ROADS, road_bugs.types_are_ignored, 2),
     (FORMATIONS, road_bugs.never_leaves, 6),
     (LANE_ENDS, road_bugs.gaps_are_given_away, 23),
-    (LANE_ENDS, road_bugs.still_listed, 445),
+    (LANE_ENDS, road_bugs.still_listed, 130),
     (LANE_ENDS, road_bugs.gap_taken_too_early, 4),
     (FORMATIONS, road_bugs.columns_are_not_reserved, 17),
     (FORMATIONS, road_bugs.exits_are_closed, 8),
@@ -52,6 +53,10 @@ def test_planted_bugs_are_noticed(
     profile: str, bug: Bug, seed: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     story = Story.drawn(seed, PROFILES[profile])
+    if bug is road_bugs.late_commands_repeat_moves:
+        # Few commands are late enough if vehicles that hold send few.
+        road = evolve(story.setup.road, hold_period_ticks=1)
+        story = evolve(story, setup=evolve(story.setup, road=road))
     assert run_story(story).violations == ()
     bug.plant(monkeypatch)
     assert run_story(story).violations != ()
