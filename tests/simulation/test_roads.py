@@ -54,7 +54,7 @@ def test_planted_bugs_are_noticed(
 ) -> None:
     story = Story.drawn(seed, PROFILES[profile])
     if bug is road_bugs.late_commands_repeat_moves:
-        # Few commands are late enough if vehicles that hold send few.
+        # At the drawn rate, vehicles that hold send too few commands for this seed.
         road = evolve(story.setup.road, hold_period_ticks=1)
         story = evolve(story, setup=evolve(story.setup, road=road))
     assert run_story(story).violations == ()

@@ -152,7 +152,7 @@ class AgentCore:
         self._sense: Sense | None = None
         self._command: Command | None = None
         self._waking = False
-        """Whether the vehicle no longer holds undisturbed, but no SENSE has shown this yet."""
+        """Whether a COMMAND has ended the rest of the vehicle, and no SENSE has followed yet."""
         self._own = {"vehicle": vehicle}
 
     @property
@@ -404,7 +404,10 @@ class AgentCore:
 
     @property
     def _forget_s(self) -> float:
-        """Time after which a newer road is forgotten: longer while it need not send anything."""
+        """Time without a message of the newest road after which an older one replaces it.
+
+        It is longer while the vehicle holds undisturbed, since the bridge then sends less often.
+        """
         resting = self._command is not None and self._command.undisturbed_ticks > 0
         return FORGET_S + 2.0 * MAX_HOLD_S if resting else FORGET_S
 

@@ -332,7 +332,7 @@ class BridgeCore:
                 pass
 
     def _on_leader(self, heartbeat: Heartbeat) -> Iterator[Effect]:
-        """Let vehicles send their states at once to a coordinator that begins to lead."""
+        """Send SENSE to vehicles at rest if another coordinator leads: it needs their states."""
         leader = heartbeat.coordinator, heartbeat.incarnation, heartbeat.term
         if heartbeat.leading and leader != self._leader:
             self._leader = leader

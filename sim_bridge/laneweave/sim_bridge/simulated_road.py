@@ -163,7 +163,7 @@ class SimulatedRoad(Generic[VehicleT]):
             vehicle.hold(command)
 
     def disturb(self) -> Iterator[Effect]:
-        """Send SENSE to the vehicles that hold undisturbed: a new leader waits for their states."""
+        """Send SENSE to the vehicles that hold undisturbed, since a leader waits for states."""
         for vehicle in self.vehicles.values():
             if not vehicle.sense_rate.full:
                 vehicle.sense_rate.disturb()

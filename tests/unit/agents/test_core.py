@@ -101,7 +101,7 @@ def test_older_ticks_and_other_vehicles_are_ignored() -> None:
 
 
 def test_a_body_that_is_pushed_out_of_the_cell_of_its_last_move_drives_back() -> None:
-    """V8: that motion begins in the cell, not where the move began, and is accepted."""
+    """V8: the motion back begins in the hold cell, so the motion controller accepts it."""
     rig = up_and_running()
     rig.accept((0, HOME, (-1, 2)))
     rig.run(2 * MOVE_TICKS)

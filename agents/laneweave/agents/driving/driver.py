@@ -117,7 +117,7 @@ class TrackingDriver:
         self._settling: Reference | None = None
         """The reference with which the vehicle settles in the cell in which it has entered."""
         self._origin: Cell = (0, 0)
-        """Cell in which the newest motion began; from its end on the goal."""
+        """Cell in which the newest motion began; the goal once that motion has ended."""
         self._goal: Cell = (0, 0)
         self._durations = scenario.timing.move_durations
         self._ticks = 0

@@ -21,7 +21,7 @@ AHEAD_S = 10.0
 
 @define
 class Newest:
-    """The newest value, which is forgotten if only lower ones arrive for `FORGET_S`, or longer."""
+    """The newest value, which is forgotten if only lower ones arrive for some time."""
 
     value: Any = None
     """None: no value yet."""

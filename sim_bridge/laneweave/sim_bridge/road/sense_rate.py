@@ -28,9 +28,9 @@ class Situation:
     cell: Cell
     motion: CurrentMotion
     ahead: tuple[Neighbour, ...]
-    """Those in its lane."""
+    """Neighbours ahead in its lane."""
     behind: tuple[Neighbour, ...]
-    """Those in its lane."""
+    """Neighbours behind in its lane."""
 
     @classmethod
     def of(
@@ -43,7 +43,7 @@ class Situation:
         return cls(record, cell, motion, ahead, behind)
 
     def is_like(self, before: Situation) -> bool:
-        """Return whether nothing has changed but measurements, and these only a little."""
+        """Return whether only measurements differ, by at most the changes at the top."""
         return (
             self.record == before.record
             and self.cell == before.cell

@@ -34,7 +34,7 @@ def drive(
 @pytest.mark.slow
 @pytest.mark.parametrize("operation", ["formations", "rolling"])
 def test_every_ballot_is_as_at_the_full_rate(tmp_path: Path, operation: str) -> None:
-    """Promises, plans and moves come in the same ticks: what waits for a vehicle wakes it."""
+    """Plans are made and come into force in the same ticks, since ballots end the rest."""
     full, expected = drive(tmp_path / "full", operation, 1)
     summary, events = drive(tmp_path / "adaptive", operation, 5)
     assert {"plan-in-force"} <= {one["kind"] for one in events}
