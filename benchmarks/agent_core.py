@@ -209,6 +209,7 @@ class Road:
     def _rig(self, vehicle: RoadVehicle) -> Rig:
         incarnations, outbox = count(1), Outbox()
         host = AgentHost(
+            vehicle.name,
             lambda name: AgentCore(
                 name,
                 incarnations.__next__,
@@ -240,7 +241,7 @@ class Road:
     def _step(self) -> None:
         tick = self.tick
         for name, rig in self.rigs.items():
-            self.senses.append((KEYS.key(SENSE, vehicle=name), self._sensed(rig)))
+            self.senses.append((KEYS.key(SENSE, process=name, vehicle=name), self._sensed(rig)))
         now = self.senses[-len(self.rigs) :]
         nodes = [rig.node for rig in self.rigs.values()]
         self.total.call(_deliver, nodes, [Received(*each) for each in now])
@@ -287,7 +288,8 @@ class Road:
         for topic, message in ((PREPARE, prepare), (PLAN, plan)):
             for rig in members:
                 name = rig.vehicle.name
-                rig.node.deliver(Received(KEYS.key(topic, vehicle=name), encode(message)), 0.0)
+                key = KEYS.key(topic, process=name, vehicle=name)
+                rig.node.deliver(Received(key, encode(message)), 0.0)
                 for _, payload in rig.take():
                     answer = decode(payload)
                     if isinstance(answer, Command):

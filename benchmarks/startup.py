@@ -82,13 +82,15 @@ class Fleet:
                 self.processes[name] = start_role(
                     context, "agent", f"agent-{name}", tables, options | {"vehicles": [name]}
                 )
-                _await_key(inbox, keys.key(VEHICLE_ALIVE, vehicle=name))
+                _await_key(inbox, keys.key(VEHICLE_ALIVE, process=name, vehicle=name))
                 self.ready_ms[name] = self._cpu_ms(name)
             for tick in range(TICKS):
                 for name in self.ready_ms:
                     before_ms = self._cpu_ms(name)
                     payload = encode(self._sense(name, tick))
-                    transport.publish(keys.key(SENSE, vehicle=name), payload, SENSE.quality)
+                    transport.publish(
+                        keys.key(SENSE, process=name, vehicle=name), payload, SENSE.quality
+                    )
                     _await_key(inbox, keys.key(COMMAND, vehicle=name))
                     if tick == 0:
                         self.first_ms[name] = self._cpu_ms(name) - before_ms

@@ -153,7 +153,7 @@ def rights_table() -> str:
 
 def _rights_of(identity: Identity) -> Iterator[str]:
     if identity.party is Party.FLEET:
-        yield "all rights of each of its vehicles"
+        yield "all rights of each of its vehicles, with its own name as that of the process"
     for exchange, verbs in _VERBS.items():
         topics = [topic for topic in TOPICS if topic.exchange is exchange]
         for verb, rights in zip(verbs, (SENDING[exchange], READING[exchange]), strict=True):
@@ -166,7 +166,7 @@ def _keys_of(
     topics: Iterable[Topic], identity: Identity, wanted: tuple[Flow, str]
 ) -> Iterator[str]:
     for topic in topics:
-        for right, parameters in rights_on(topic, identity.party, identity.name):
+        for right, parameters in rights_on(topic, identity.party, identity.name, identity.name):
             if right == wanted:
                 shown = dict.fromkeys(topic.parameters, "*") | parameters
                 yield topic.pattern.format_map(shown)
@@ -220,7 +220,7 @@ def _topics() -> str:
     for topic in TOPICS:
         message = "none" if topic.kind is None else f"`{topic.kind.__name__}`"
         sender = f"{topic.sender}, {topic.deputy} in its place" if topic.deputy else topic.sender
-        own = [f"own {topic.addressee}"] if topic.addressee else []
+        own = ["the process of the key"] if topic.addressed else []
         lines.append(
             f"| `{topic.name}` | `{topic.pattern}` | {message} | {sender} "
             f"| `{topic.quality.name}` | {'yes' if topic.reliable else 'no'} "

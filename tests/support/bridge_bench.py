@@ -176,11 +176,12 @@ class Desk:
             self.core.road.answers.up.add(Name(vehicle))
         return self.give(Started())
 
-    def up(self, vehicle: str) -> list[Effect]:
-        return self.give(PeerUp(VEHICLE_ALIVE, {"vehicle": vehicle}))
+    def up(self, vehicle: str, process: str | None = None) -> list[Effect]:
+        """Show the token of a vehicle's agent in a process, by default in one of its name."""
+        return self.give(PeerUp(VEHICLE_ALIVE, _of_agent(vehicle, process)))
 
-    def down(self, vehicle: str) -> list[Effect]:
-        return self.give(PeerDown(VEHICLE_ALIVE, {"vehicle": vehicle}))
+    def down(self, vehicle: str, process: str | None = None) -> list[Effect]:
+        return self.give(PeerDown(VEHICLE_ALIVE, _of_agent(vehicle, process)))
 
     def wake(self) -> list[Effect]:
         """Let time pass until the bridge wants to be woken."""
@@ -349,7 +350,7 @@ class Street:
     def start_agents(self, *vehicles: str) -> Sleeper:
         """Start one process for some vehicles."""
         names = [Name(vehicle) for vehicle in vehicles]
-        host = Sleeper(self._make_host(self.scenario, names))
+        host = Sleeper(self._make_host(names[0], self.scenario, names))
         identity = Identity(Party.VEHICLE, vehicles[0])
         self._add_agents(f"agent-{vehicles[0]}", host, identity, "named", self.scenario)
         return host
@@ -359,7 +360,7 @@ class Street:
     ) -> AgentHost:
         """Start a process for all vehicles of its shard, perhaps with a scenario of its own."""
         scenario, shard = scenario or self.scenario, Shard(index, count)
-        host = self._make_host(scenario, shard=shard)
+        host = self._make_host(Name(shard.name), scenario, shard=shard)
         identity = Identity(Party.FLEET, shard.name)
         self._add_agents(f"shard-{index}", host, identity, shard.name, scenario)
         return host
@@ -372,10 +373,15 @@ class Street:
         self._add(name, CheckedCore(core, process, settings, SENSE))
 
     def _make_host(
-        self, scenario: Scenario, vehicles: Sequence[Name] = (), shard: Shard | None = None
+        self,
+        process: Name,
+        scenario: Scenario,
+        vehicles: Sequence[Name] = (),
+        shard: Shard | None = None,
     ) -> AgentHost:
         make_agent = partial(self._make_agent, scenario)
-        return AgentHost(make_agent, self._new_incarnation(), scenario.runtime, vehicles, shard)
+        incarnation = self._new_incarnation()
+        return AgentHost(process, make_agent, incarnation, scenario.runtime, vehicles, shard)
 
     def _make_agent(self, scenario: Scenario, vehicle: Name) -> AgentCore:
         self.agents[vehicle] = AgentCore(vehicle, self._new_incarnation, scenario)
@@ -412,7 +418,11 @@ class Street:
         )
         prepare = Prepare(plan.ballot, blocks, (name,))
         for topic, message in ((PREPARE, prepare), (PLAN, plan)):
-            self.network.inject(KEYS.key(topic, vehicle=vehicle), encode(message))
+            self.network.inject(KEYS.key(topic, process=vehicle, vehicle=vehicle), encode(message))
             self.network.run(self.network.now_s + 0.02)  # nothing overtakes it
         assert agent.execution is not None
         assert agent.execution.plan == plan
+
+
+def _of_agent(vehicle: str, process: str | None) -> dict[str, str]:
+    return {"process": process or vehicle, "vehicle": vehicle}

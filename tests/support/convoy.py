@@ -72,7 +72,7 @@ class Convoy:
         if tick % 10 == 0:
             yield Send(CENSUS, self.census(tick))
         if tick % 40 == 0:
-            yield Send(PLAN, self.plan(tick), {"vehicle": self.names[0]})
+            yield Send(PLAN, self.plan(tick), {"process": "p", "vehicle": self.names[0]})
         for one in self.coordinators:
             yield Send(HEARTBEAT, one, {"coordinator": one.coordinator})
         for number in range(self.count):

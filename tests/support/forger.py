@@ -137,7 +137,7 @@ class Forger:
                 self._of_victim.clear()
             # With a certificate, a vehicle may read only this key.
             for transport in self._transports:
-                transport.subscribe(self._keys.key(SENSE, vehicle=self.victim))
+                transport.subscribe(self._keys.key(SENSE, process=self, vehicle=self.victim))
         return bool(candidates) and len(self._of_victim) == len(OF_VEHICLE)
 
     def keep_victim(self) -> None:

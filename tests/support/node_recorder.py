@@ -68,7 +68,7 @@ def at_start(*effects: node.Effect) -> Handler:
 
 
 def token(name: str) -> node.Announce:
-    return node.Announce(VEHICLE_ALIVE, {"vehicle": name})
+    return node.Announce(VEHICLE_ALIVE, {"process": name, "vehicle": name})
 
 
 def listener() -> Recorder:

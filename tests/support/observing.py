@@ -84,7 +84,7 @@ class Listener:
         self.view.update(Arrived(topics.ROAD_STATUS, {}, message), now_s)
 
     def agent(self, vehicle: str) -> None:
-        self.view.update(PeerUp(topics.VEHICLE_ALIVE, {"vehicle": vehicle}), 0.0)
+        self.view.update(PeerUp(topics.VEHICLE_ALIVE, {"process": "p", "vehicle": vehicle}), 0.0)
 
     def clock(
         self,

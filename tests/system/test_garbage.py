@@ -71,7 +71,7 @@ def messages(vehicle: Name, *, number: int, real: float) -> dict[type, Any]:
 
 def keys_of(topic: Topic, vehicle: str) -> Iterator[str]:
     """Return keys of a topic: of somebody who is there and of somebody who is not."""
-    there = {"vehicle": vehicle, "block": 0, "stretch": 0, "coordinator": "c1"}
+    there = {"process": vehicle, "vehicle": vehicle, "block": 0, "stretch": 0, "coordinator": "c1"}
     there |= {"role": "agent", "name": vehicle, "incarnation": 1}
     there |= {"session": "s1", "client": "client", "drives": "0-of-1", "digests": "0-0-0-0"}
     nobody = dict.fromkeys(topic.parameters, "ghost") | {"block": 99, "stretch": 99}
@@ -152,7 +152,7 @@ def say_nonsense(transport: ZenohTransport) -> None:
                 for key in keys_of(topic, "v0001"):
                     transport.publish(key, encode(forged[topic.kind]), Quality.ASSURED)
     transport.publish("laneweave/default/nothing", b"", Quality.ASSURED)
-    transport.publish("laneweave/default/sense/v0001/more", b"", Quality.ASSURED)
+    transport.publish("laneweave/default/sense/v0001/v0001/more", b"", Quality.ASSURED)
     transport.publish("laneweave/default/command/" + "v" * 1000, b"", Quality.ASSURED)
 
 
@@ -164,7 +164,10 @@ def show_tokens(transport: ZenohTransport) -> None:
         for incarnation in ("x", "-1", "1.5", "٣", "9" * 60, "9" * 5000, "0x10", "%00")
     ]
     keys += [f"{alive}/coordinator/c0/not-a-number", f"{alive}/vehicle/{'v' * 500}"]
-    keys += [KEYS.key(VEHICLE_ALIVE, vehicle=GHOST), KEYS.key(BRIDGE_ALIVE, incarnation=GHOST)]
+    keys += [
+        KEYS.key(VEHICLE_ALIVE, process=GHOST, vehicle=GHOST),
+        KEYS.key(BRIDGE_ALIVE, incarnation=GHOST),
+    ]
     keys += [KEYS.key(COORDINATOR_ALIVE, coordinator=GHOST, incarnation=7)]
     keys += [KEYS.key(STATE, block=0, vehicle=GHOST), f"{alive}/x", KEYS.key(SERVICE)]
     for key in keys:

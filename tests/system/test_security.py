@@ -108,9 +108,9 @@ def network(secured: tuple[Path, Scenario]) -> Iterator[Network]:
 PUBLISHED: tuple[tuple[str, Topic, dict[str, object], str, tuple[str, ...]], ...] = (
     ("bridge", CLOCK, {}, "coordinator.c2", ()),
     ("bridge", CENSUS, {}, "coordinator.c2", ()),
-    ("bridge", SENSE, {"vehicle": B}, f"vehicle.{B}", ()),
-    ("coordinator.c1", PREPARE, {"vehicle": B}, f"vehicle.{B}", ("coordinator.c3",)),
-    ("coordinator.c1", PLAN, {"vehicle": B}, f"vehicle.{B}", ("coordinator.c3",)),
+    ("bridge", SENSE, {"process": B, "vehicle": B}, f"vehicle.{B}", ()),
+    ("coordinator.c1", PREPARE, {"process": B, "vehicle": B}, f"vehicle.{B}", ("coordinator.c3",)),
+    ("coordinator.c1", PLAN, {"process": B, "vehicle": B}, f"vehicle.{B}", ("coordinator.c3",)),
     ("coordinator.c1", HEARTBEAT, {"coordinator": "c1"}, "coordinator.c2", ()),
     ("coordinator.c1", EVENT, {"role": "coordinator", "name": "c1"}, "bridge", ()),
     (f"vehicle.{B}", COMMAND, {"vehicle": B}, "bridge", (FLEETS[B],)),
@@ -162,7 +162,7 @@ def test_other_ways_of_naming_a_key_are_no_ways_around(network: Network) -> None
 # --- what is read ---------------------------------------------------------------------------------
 
 EVERYTHING = ("**", "laneweave/**", "laneweave/test/**", "laneweave/*/*/*", "laneweave/test/*/*",
-              "laneweave/test/plan/*", "laneweave/test/plan/v$*")  # fmt: skip
+              "laneweave/test/plan/*/*", "laneweave/test/plan/*/v$*")  # fmt: skip
 MAY_READ: dict[str, tuple[str, ...]] = {
     f"vehicle.{A}": ("state",),
     "fleet.agents-1": ("state", "census"),
@@ -179,9 +179,9 @@ def test_nobody_reads_what_is_for_somebody_else(network: Network) -> None:
     bridge, leader = network.join("bridge"), network.join("coordinator.c1")
     vehicle = network.join(f"vehicle.{B}")
     sent: tuple[tuple[Member, Member, Topic, dict[str, object]], ...] = (
-        (leader, vehicle, PLAN, {"vehicle": B}),
-        (leader, vehicle, PREPARE, {"vehicle": B}),
-        (bridge, vehicle, SENSE, {"vehicle": B}),
+        (leader, vehicle, PLAN, {"process": B, "vehicle": B}),
+        (leader, vehicle, PREPARE, {"process": B, "vehicle": B}),
+        (bridge, vehicle, SENSE, {"process": B, "vehicle": B}),
         (vehicle, bridge, COMMAND, {"vehicle": B}),
         (vehicle, leader, STATE, {"block": 1, "vehicle": B}),
         (bridge, leader, CENSUS, {}),
@@ -210,10 +210,10 @@ def test_nobody_reads_what_is_for_somebody_else(network: Network) -> None:
 def test_a_vehicle_reads_its_own_plan_and_nobody_elses(network: Network) -> None:
     leader = network.join("coordinator.c1")
     first, second = network.join(f"vehicle.{A}"), network.join(f"vehicle.{B}")
-    first.transport.subscribe(KEYS.key(PLAN, vehicle=B))
-    until_heard(leader, second, PLAN, vehicle=B)
-    until_heard(leader, first, PLAN, vehicle=A)
-    assert {key for key, _ in first.received()} == {KEYS.key(PLAN, vehicle=A)}
+    first.transport.subscribe(KEYS.key(PLAN, process=B, vehicle=B))
+    until_heard(leader, second, PLAN, process=B, vehicle=B)
+    until_heard(leader, first, PLAN, process=A, vehicle=A)
+    assert {key for key, _ in first.received()} == {KEYS.key(PLAN, process=A, vehicle=A)}
 
 
 # --- tokens ---------------------------------------------------------------------------------------
@@ -222,7 +222,7 @@ def test_a_vehicle_reads_its_own_plan_and_nobody_elses(network: Network) -> None
 def test_nobody_shows_somebody_elses_token(network: Network) -> None:
     bridge, leader = network.join("bridge"), network.join("coordinator.c2")
     shown = {
-        KEYS.key(VEHICLE_ALIVE, vehicle=B): f"vehicle.{B}",
+        KEYS.key(VEHICLE_ALIVE, process=B, vehicle=B): f"vehicle.{B}",
         KEYS.key(COORDINATOR_ALIVE, coordinator="c1", incarnation=7): "coordinator.c1",
         KEYS.key(BRIDGE_ALIVE, incarnation=8): "bridge",
         KEYS.key(CLIENT_ALIVE, session="secret", client="other"): "client.other",

@@ -29,17 +29,12 @@ from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell, PlannedMove, stretch_of
 from laneweave.protocol.road_layout import NO_PARTS, TemporaryParts
 from laneweave.protocol.runtime.node import (
-    Announce,
     Arrived,
     Effect,
     Event,
-    Listen,
     Refuse,
     Send,
-    Started,
     Stopping,
-    Unlisten,
-    Withdraw,
 )
 from laneweave.protocol.scenario.deployment_fields import MAX_HOLD_S
 from laneweave.protocol.scenario.fields import Scenario
@@ -69,12 +64,8 @@ from laneweave.protocol.wire.process_messages import Report
 from laneweave.protocol.wire.topics import (
     COMMAND,
     MOTION,
-    PLAN,
-    PREPARE,
     REPORT,
-    SENSE,
     STATE,
-    VEHICLE_ALIVE,
 )
 
 MAX_REPEATS = 50
@@ -192,12 +183,6 @@ class AgentCore:
             self._want_states()
             return effects
         match event:
-            case Started():
-                return [
-                    *(Listen(topic, self._own) for topic in (SENSE, PREPARE, PLAN)),
-                    # Last: a process that sees the token may rely on the subscriptions.
-                    Announce(VEHICLE_ALIVE, self._own),
-                ]
             case Stopping():
                 return [self._final_report()]
             case _:
@@ -469,11 +454,7 @@ class AgentCore:
         if self.ended:
             return []
         self.ended, self.wanted_motions, self.wanted_states = True, (), ()
-        return [
-            self._final_report(),
-            *(Unlisten(topic, self._own) for topic in (SENSE, PREPARE, PLAN)),
-            Withdraw(VEHICLE_ALIVE, self._own),
-        ]
+        return [self._final_report()]
 
     def _final_report(self) -> Effect:
         stats = self.solver_stats

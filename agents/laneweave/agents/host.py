@@ -12,6 +12,7 @@ from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.road_layout import NO_PARTS
 from laneweave.protocol.runtime.metrics import MetricsSnapshot, metric
 from laneweave.protocol.runtime.node import (
+    Announce,
     Arrived,
     Effect,
     End,
@@ -25,6 +26,7 @@ from laneweave.protocol.runtime.node import (
     Unlisten,
     Wakeup,
     Watch,
+    Withdraw,
 )
 from laneweave.protocol.scenario.deployment_fields import Runtime, Shard
 from laneweave.protocol.wire.messages import Census, Motion, Name, Sense, VehicleState
@@ -35,8 +37,11 @@ from laneweave.protocol.wire.topics import (
     CENSUS,
     MOTION,
     OBSTACLES,
+    PLAN,
+    PREPARE,
     SENSE,
     STATE,
+    VEHICLE_ALIVE,
     Topic,
     incarnation_of,
 )
@@ -65,6 +70,7 @@ class AgentHost:
 
     def __init__(
         self,
+        process: Name,
         make_agent: Callable[[Name], AgentCore],
         incarnation: int,
         runtime: Runtime,
@@ -74,12 +80,14 @@ class AgentHost:
         """Host the named vehicles, or all announced vehicles of a shard.
 
         Args:
+            process: name of this process, to which messages to its vehicles are addressed.
             make_agent: returns the agent of a vehicle.
             incarnation: of this process; bounds those that it receives.
             runtime: tick, and limits of road time.
             vehicles: names of the vehicles; empty with a shard.
             shard: share of the announced vehicles.
         """
+        self._process = process
         self._make_agent = make_agent
         self._shard = shard
         self._agents: dict[Name, AgentCore] = {name: make_agent(name) for name in vehicles}
@@ -150,7 +158,12 @@ class AgentHost:
                 effects: list[Effect] = [Watch(BRIDGE_ALIVE), Listen(OBSTACLES)]
                 if self._shard is not None:
                     effects.append(Listen(CENSUS))
-                return effects + self._dispatch_to_all(event, now_s)
+                own = {"process": self._process}
+                effects += [Listen(topic, own) for topic in (SENSE, PREPARE, PLAN)]
+                # Last: a process that sees a token may rely on the subscriptions.
+                return effects + [
+                    Announce(VEHICLE_ALIVE, self._token(name)) for name in self._agents
+                ]
             case PeerUp(topic, parameters) if topic is BRIDGE_ALIVE:
                 incarnation = incarnation_of(parameters)
                 self._bounds.check_incarnation(incarnation, now_s)
@@ -190,7 +203,7 @@ class AgentHost:
         if isinstance(message, Sense) and name in self._left and not message.left:
             _, tick = self._left[name]
             if message.tick > tick:
-                return [*self._start(name, now_s), *self._dispatch(event, name, now_s)]
+                return [self._start(name), *self._dispatch(event, name, now_s)]
         return []
 
     def _dispatch_to_all(self, event: Event, now_s: float) -> list[Effect]:
@@ -224,40 +237,41 @@ class AgentHost:
             agent.on_obstacles(NO_PARTS)
         if self._shard is not None:
             for name in list(self._agents):
-                effects += self._remove(name).leave()
+                effects += self._remove(name)
             self._seen.clear()
         return effects
 
-    def _remove(self, name: Name) -> AgentCore:
-        """Remove an agent and keep its counters."""
+    def _token(self, name: Name) -> dict[str, Name]:
+        """Return the parameters of the token of a vehicle's agent."""
+        return {"process": self._process, "vehicle": name}
+
+    def _remove(self, name: Name) -> list[Effect]:
+        """Remove an agent, let it leave, and keep its counters."""
         agent = self._agents.pop(name)
         stats = agent.solver_stats
         self._solves += stats.solves
         self._unusable += stats.unusable
-        return agent
+        return [*agent.leave(), Withdraw(VEHICLE_ALIVE, self._token(name))]
 
     def _dispatch(self, event: Arrived, name: Name, now_s: float) -> list[Effect]:
         agent = self._agents[name]
         wanted = agent.wanted_motions, agent.wanted_states
         effects = agent.handle(event, now_s)
         if agent.ended:
-            self._remove(name)
+            effects += self._remove(name)
             self._left[name] = now_s, event.message.tick
-            if self._shard is None:
-                # Until the process ends, a SENSE shows whether the message was true.
-                effects.append(Listen(SENSE, {"vehicle": name}))
         # Not after every message, since an update iterates over all agents.
         if agent.ended or wanted != (agent.wanted_motions, agent.wanted_states):
             self._update_subscriptions(effects)
         return effects
 
-    def _start(self, name: Name, now_s: float) -> list[Effect]:
+    def _start(self, name: Name) -> Effect:
         """Start the agent of a vehicle, perhaps of one that had not left although it was told."""
         self._left.pop(name, None)
         self._agents[name] = self._make_agent(name)
         if self._obstacles is not None:
             self._agents[name].on_obstacles(self._obstacles.temporary)
-        return list(self._agents[name].handle(Started(), now_s))
+        return Announce(VEHICLE_ALIVE, self._token(name))
 
     def _on_obstacles(self, message: Obstacles, now_s: float) -> None:
         """Pass the parts of lanes that are closed now to all agents."""
@@ -284,10 +298,10 @@ class AgentHost:
         for name in listed:
             is_back = name in self._left and now_s >= self._left[name][0] + RETURN_S
             if is_back or (name not in self._seen and shard.contains(name)):
-                effects += self._start(name, now_s)
+                effects.append(self._start(name))
         for name in sorted(set(self._agents) - set(listed)):
             # The vehicle has left, and the SENSE that reports it was lost.
-            effects += self._remove(name).leave()
+            effects += self._remove(name)
         self._seen = set(listed)
         self._left = {name: told for name, told in self._left.items() if name in listed}
         return effects

@@ -68,15 +68,16 @@ def run_agents(
     incarnations = Incarnations()
     incarnation = incarnations()
     names = [Name(vehicle) for vehicle in vehicles]
+    drives = "named" if shard is None else shard.name
+    process = Process.of(parse_identity(access.identity), incarnation, drives)
     host = AgentHost(
+        process.name,
         lambda vehicle: AgentCore(vehicle, incarnations, scenario),
         incarnation,
         scenario.runtime,
         names,
         shard,
     )
-    drives = "named" if shard is None else shard.name
-    process = Process.of(parse_identity(access.identity), incarnation, drives)
     settings = settings_of(scenario)
     core = CheckedCore(host, process, settings, SENSE)
     run_core(wrap(core), access, observe=observe)

@@ -13,7 +13,7 @@ from attrs import frozen
 from laneweave.coordinator.election import Election
 from laneweave.coordinator.formations.leader import LEADER_RULES
 from laneweave.coordinator.formations.operation import FormationsOperation
-from laneweave.coordinator.operation import LogEntry, Operation
+from laneweave.coordinator.operation import LogEntry, Operation, Outcome, ToVehicle
 from laneweave.coordinator.planning.response import PlanFunction
 from laneweave.coordinator.planning.solve import plan
 from laneweave.coordinator.rolling.checked_planner import Planner, stream_planner
@@ -54,6 +54,7 @@ from laneweave.protocol.wire.messages import (
     Census,
     Heartbeat,
     Name,
+    Plan,
     RoadClock,
     VehicleState,
 )
@@ -69,6 +70,8 @@ from laneweave.protocol.wire.topics import (
     EVENT,
     HEARTBEAT,
     OBSTACLES,
+    PLAN,
+    PREPARE,
     REPORT,
     SERVICE,
     SERVICE_CANCEL,
@@ -136,6 +139,8 @@ class CoordinatorCore:
         self.census: Census | None = None
         self._formation_of: dict[Name, int] = {}
         """Block that each vehicle in the census entered."""
+        self._processes_of: dict[Name, tuple[Name, ...]] = {}
+        """Processes with an agent for each vehicle in the census."""
         self._handled_s = self._awake_since_s = 0.0
         """Time of the last event; start of the current gap-free series of events (node clock)."""
         self._incarnation = incarnation
@@ -254,7 +259,7 @@ class CoordinatorCore:
         self._road_number = self._road.number
         self.census = None
         self._obstacles_s = -math.inf
-        self._formation_of = {}
+        self._formation_of, self._processes_of = {}, {}
         self.operation.forget()
 
     def _on_event(self, event: Event, now_s: float) -> Iterator[Effect]:
@@ -338,6 +343,9 @@ class CoordinatorCore:
                     block_of = self.scenario.lattice.block_of
                     self._formation_of = {
                         entry.vehicle: block_of(entry.cell[0]) for entry in message.on_lattice
+                    }
+                    self._processes_of = {
+                        entry.vehicle: entry.processes for entry in message.on_road
                     }
                     self._road_changed = True
             case _:
@@ -430,13 +438,18 @@ class CoordinatorCore:
             ballot = ballot._replace(term=above.term + 1)
         return ballot
 
-    def _effects(self, outcomes: Iterable[Effect | LogEntry]) -> Iterator[Effect]:
-        """Yield outcomes as effects; log entries become messages."""
+    def _effects(self, outcomes: Iterable[Outcome]) -> Iterator[Effect]:
+        """Yield outcomes as effects."""
         for outcome in outcomes:
-            if isinstance(outcome, LogEntry):
-                yield self._log(outcome.kind, **outcome.data)
-            else:
-                yield outcome
+            match outcome:
+                case LogEntry(kind, data):
+                    yield self._log(kind, **data)
+                case ToVehicle(vehicle, message):
+                    topic = PLAN if isinstance(message, Plan) else PREPARE
+                    for process in self._processes_of.get(vehicle) or (vehicle,):
+                        yield Send(topic, message, {"process": process, "vehicle": vehicle})
+                case _:
+                    yield outcome
 
     def _new_job(self) -> int:
         self._last_job += 1

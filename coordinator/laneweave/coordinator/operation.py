@@ -7,10 +7,10 @@ from typing import Any, Protocol
 
 from attrs import field, frozen
 
+from laneweave.protocol.quick_frozen import quick_frozen
 from laneweave.protocol.road_layout import TemporaryParts
-from laneweave.protocol.runtime.node import Compute, Computed, Effect, Send
+from laneweave.protocol.runtime.node import Compute, Computed, Effect
 from laneweave.protocol.wire.messages import Census, Name, Plan, Prepare, VehicleState
-from laneweave.protocol.wire.topics import PLAN, PREPARE
 
 
 @frozen
@@ -19,6 +19,18 @@ class LogEntry:
 
     kind: str
     data: dict[str, Any] = field(factory=dict)
+
+
+@quick_frozen
+class ToVehicle:
+    """A message to send to a vehicle."""
+
+    vehicle: Name
+    message: Prepare | Plan
+
+
+Outcome = Effect | LogEntry | ToVehicle
+"""What an operation yields: effects, and what the coordinator's core makes into effects."""
 
 
 class Operation(Protocol):
@@ -42,9 +54,7 @@ class Operation(Protocol):
     def on_state(self, state: VehicleState, now_s: float) -> list[LogEntry] | None:
         """Handle the state of a vehicle on the road; return None if nothing depends on it."""
 
-    def lead(
-        self, census: Census, t_s: float, now_s: float, *, changed: bool
-    ) -> Iterable[Effect | LogEntry]:
+    def lead(self, census: Census, t_s: float, now_s: float, *, changed: bool) -> Iterable[Outcome]:
         """Handle expired timers, request plans, and send or resend messages.
 
         Args:
@@ -64,9 +74,3 @@ class Operation(Protocol):
     @property
     def in_force(self) -> int:
         """Number of plans in force."""
-
-
-def to_vehicle(vehicle: Name, message: Prepare | Plan) -> Send:
-    """Return the effect that sends a message to a vehicle."""
-    topic = PLAN if isinstance(message, Plan) else PREPARE
-    return Send(topic, message, {"vehicle": vehicle})

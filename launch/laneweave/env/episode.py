@@ -64,7 +64,11 @@ class Episode:
             stopwatch=_no_time,
         )
         agents = AgentHost(
-            self._make_agent, next(self._incarnations), scenario.runtime, shard=Shard(0, 1)
+            Name("agents"),
+            self._make_agent,
+            next(self._incarnations),
+            scenario.runtime,
+            shard=Shard(0, 1),
         )
         cores: dict[str, Core] = {
             name: make_coordinator(Name(name), 1, scenario) for name in coordinator_names(scenario)

@@ -53,7 +53,6 @@ from laneweave.protocol.wire.topics import (
 from laneweave.sim_bridge.agent_log import AgentLog
 from laneweave.sim_bridge.deployment import Deployment
 from laneweave.sim_bridge.recording.record_interface import Record
-from laneweave.sim_bridge.road.caretakers import notify_left
 from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.road.demand_queue import NO_OUTSIDE_TRAFFIC, OutsideTraffic
 from laneweave.sim_bridge.road.obstacles import Breakdown
@@ -304,8 +303,9 @@ class BridgeCore:
                     self._unreported.add(parameters["vehicle"])
             case Wakeup() if self.phase is TickPhase.ANSWERS:
                 for name, copies in groupby(self._answers.due_resends(now_s)):
-                    sense = self.road.sense_of(self.vehicles[name])  # encoded once
-                    yield from (sense for _ in copies)
+                    senses = self.road.sense_of(self.vehicles[name])  # encoded once
+                    for _ in copies:
+                        yield from senses
             case Stopping():
                 yield from self._desk.close()
                 # While the bridge waits for final reports, the run itself has ended.
@@ -456,7 +456,7 @@ class BridgeCore:
         yield from self._roadside.publish(self.tick, self.t_s, on_road, ended=True)
         yield from self.road.caretakers.notify_departed(self.tick)
         for vehicle in on_road:
-            yield notify_left(vehicle, self.tick)
+            yield from vehicle.send_sense(self.tick, left=True)
         # Sent last, through the network like the other reports: the node adds its counters.
         yield Send(REPORT, Report(role=BRIDGE, name=BRIDGE), {"role": BRIDGE, "name": BRIDGE})
         self.phase = TickPhase.SHUTTING_DOWN

@@ -21,15 +21,15 @@ from laneweave.protocol.runtime.node import (
     Effect,
     Event,
     Listen,
+    PeerDown,
     PeerUp,
-    Send,
     Watch,
 )
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.wire.bounds import check_ballot
 from laneweave.protocol.wire.events import AGENT_SILENT
 from laneweave.protocol.wire.messages import Command, Name, Plan, Prepare
-from laneweave.protocol.wire.topics import BRIDGE_ALIVE, COMMAND, SENSE, VEHICLE_ALIVE
+from laneweave.protocol.wire.topics import BRIDGE_ALIVE, COMMAND, VEHICLE_ALIVE
 from laneweave.sim_bridge.recording.record_interface import RoadRecord
 from laneweave.sim_bridge.road.caretakers import Caretakers
 from laneweave.sim_bridge.road.entry import Admission
@@ -107,10 +107,12 @@ class SimulatedRoad(Generic[VehicleT]):
     def on_network(self, event: Event, now_s: float) -> None:
         """Handle agents' tokens and the state of the bridge's connection; ignore other events."""
         self.caretakers.on_network(event, now_s)
-        if isinstance(event, PeerUp) and event.topic is VEHICLE_ALIVE:
+        if isinstance(event, (PeerUp, PeerDown)) and event.topic is VEHICLE_ALIVE:
             vehicle = self.vehicles.get(Name(event.parameters["vehicle"]))
             if vehicle is not None:
-                vehicle.sense_rate.disturb()  # perhaps another process
+                if self.caretakers.update_processes(vehicle):
+                    self._roadside.publisher.on_changed()
+                vehicle.sense_rate.disturb()
 
     def on_ballot(self, vehicle: Name, message: Prepare | Plan) -> Iterator[Effect]:
         """Pass a message of a leader to the vehicle's caretaker."""
@@ -135,7 +137,7 @@ class SimulatedRoad(Generic[VehicleT]):
             self.answers.received(name, now_s, current=in_time)
         had_caretaker = name in self.caretakers
         if self.caretakers.register_command(vehicle, command):
-            effects.append(self.sense_of(vehicle))
+            effects += self.sense_of(vehicle)
         if not command.undisturbed_ticks:
             vehicle.sense_rate.disturb()
         if not in_time:
@@ -167,13 +169,11 @@ class SimulatedRoad(Generic[VehicleT]):
         for vehicle in self.vehicles.values():
             if not vehicle.sense_rate.full:
                 vehicle.sense_rate.disturb()
-                yield self.sense_of(vehicle)
+                yield from self.sense_of(vehicle)
 
-    def sense_of(self, vehicle: RoadVehicle) -> Effect:
-        """Return the SENSE of a vehicle in the current tick."""
-        caretaker = vehicle.name in self.caretakers
-        sense = vehicle.sense(self.tick, caretaker=caretaker)
-        return Send(SENSE, sense, {"vehicle": vehicle.name})
+    def sense_of(self, vehicle: RoadVehicle) -> list[Effect]:
+        """Return the SENSE of a vehicle in the current tick, for each process with an agent."""
+        return vehicle.send_sense(self.tick, caretaker=vehicle.name in self.caretakers)
 
     # --- the tick -----------------------------------------------------------------------------
 
@@ -191,6 +191,7 @@ class SimulatedRoad(Generic[VehicleT]):
         entered, self.at_entrance = self.at_entrance, []
         for vehicle in entered:
             vehicle.controller.occupancy = self._occupied_cells
+            self.caretakers.update_processes(vehicle)
             vehicle.close(self._roadside.lane_ends, self.t_s)
             self.vehicles[vehicle.name] = vehicle
             self._record.on_entered(vehicle)
@@ -213,7 +214,7 @@ class SimulatedRoad(Generic[VehicleT]):
             vehicle.controller.end_move(self.t_s)
             if vehicle.needs_sense(self.tick):
                 sensed.append(vehicle.name)
-                yield self.sense_of(vehicle)
+                yield from self.sense_of(vehicle)
         yield from self.caretakers.states(self.tick)
         yield from self.caretakers.notify_departed(self.tick)
         all_sensed = len(sensed) == len(self.vehicles)

@@ -169,6 +169,8 @@ def test_a_ballot_of_an_impossible_term_is_not_promised() -> None:
 
 # --- shards -----------------------------------------------------------------------------------
 
+PROCESS = Name("p")
+
 
 class Fleet:
     """An agent process with a shard, on the road of bridge 1000."""
@@ -176,6 +178,7 @@ class Fleet:
     def __init__(self) -> None:
         """Host the agent of one vehicle."""
         self.host = AgentHost(
+            PROCESS,
             lambda name: AgentCore(name, lambda: 1, PAPER, LightDriver),
             BRIDGE,
             PAPER.runtime,
@@ -183,7 +186,7 @@ class Fleet:
         )
         self.now_s = 0.0
         self.token(BRIDGE)
-        assert Announce(VEHICLE_ALIVE, {"vehicle": ME}) in self.census()
+        assert Announce(VEHICLE_ALIVE, {"process": PROCESS, "vehicle": ME}) in self.census()
 
     def token(self, incarnation: object, *, up: bool = True) -> list[Effect]:
         kind = PeerUp if up else PeerDown
@@ -214,4 +217,4 @@ def test_a_shard_returns_to_the_bridge_whose_token_is_left() -> None:
     fleet.token(DAY_NS)
     assert fleet.census() == []
     fleet.token(DAY_NS, up=False)
-    assert Announce(VEHICLE_ALIVE, {"vehicle": ME}) in fleet.census()
+    assert Announce(VEHICLE_ALIVE, {"process": PROCESS, "vehicle": ME}) in fleet.census()

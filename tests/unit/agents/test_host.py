@@ -35,13 +35,22 @@ FRONT: Cell = (0, 0)
 """In formation 0; the next block begins at column -4."""
 SIDE: Cell = (-1, 1)
 """Likewise."""
+PROCESS = Name("p")
+ADDRESSED_TO_IT = [
+    node.Listen(topic, {"process": PROCESS})
+    for topic in (topics.SENSE, topics.PREPARE, topics.PLAN)
+]
 STATES_OF_0 = topics.STATE, {"block": 0}
 
 
 def make_host(*vehicles: Name, shard: Shard | None = None) -> AgentHost:
     return AgentHost(
-        lambda name: AgentCore(name, lambda: 1, PAPER), 1, PAPER.runtime, vehicles, shard
+        PROCESS, lambda name: AgentCore(name, lambda: 1, PAPER), 1, PAPER.runtime, vehicles, shard
     )
+
+
+def token(vehicle: Name) -> dict[str, Name]:
+    return {"process": PROCESS, "vehicle": vehicle}
 
 
 def give(host: AgentHost, event: node.Event, now_s: float = 0.0) -> list[node.Effect]:
@@ -55,7 +64,7 @@ def vehicles_of(host: AgentHost) -> int:
 
 
 def hand(host: AgentHost, topic: topics.Topic, vehicle: Name, message: object) -> list[node.Effect]:
-    return give(host, node.Arrived(topic, {"vehicle": vehicle}, message))
+    return give(host, node.Arrived(topic, token(vehicle), message))
 
 
 def feel(
@@ -101,7 +110,9 @@ def accept(
 def test_events_go_to_the_vehicle_that_they_concern() -> None:
     host = make_host(A, B)
     started = give(host, node.Started())
-    assert [e.parameters["vehicle"] for e in started if isinstance(e, node.Announce)] == [A, B]
+    # Last the tokens: a process that sees one may rely on the subscriptions.
+    tokens = [node.Announce(topics.VEHICLE_ALIVE, token(name)) for name in (A, B)]
+    assert started[-5:] == [*ADDRESSED_TO_IT, *tokens]
     effects = feel(host, B, SIDE)
     assert [each.vehicle for each in sent(effects, Command)] == [B]
     assert [each.vehicle for each in sent(effects, VehicleState)] == [B]
@@ -175,12 +186,11 @@ def test_an_agent_comes_back_that_was_told_in_error_that_its_vehicle_has_left() 
     give(host, node.Started())
     feel(host, A)
     told = feel(host, A, FRONT, 2, left=True)
-    assert node.Withdraw(topics.VEHICLE_ALIVE, {"vehicle": A}) in told
-    listening = node.Listen(topics.SENSE, {"vehicle": A})
-    assert told.index(listening) > told.index(node.Unlisten(topics.SENSE, {"vehicle": A}))
+    assert node.Withdraw(topics.VEHICLE_ALIVE, token(A)) in told
+    assert not any(isinstance(effect, node.Unlisten) and effect.topic.addressed for effect in told)
     assert feel(host, A, FRONT, 2) == feel(host, A, FRONT, 1) == []  # late
     back = feel(host, A, FRONT, 3)
-    assert node.Announce(topics.VEHICLE_ALIVE, {"vehicle": A}) in back
+    assert node.Announce(topics.VEHICLE_ALIVE, token(A)) in back
     assert topics.COMMAND in [getattr(effect, "topic", None) for effect in back]
     assert vehicles_of(host) == 1
     assert host.wakeup_s == NO_BRIDGE_S  # the process does not end
@@ -193,7 +203,7 @@ def test_an_agent_of_a_shard_comes_back_if_the_census_lists_its_vehicle_for_long
     feel(host, A, FRONT, 2, left=True)
     assert give(host, census(on_road=[A]), 0.9 * RETURN_S) == []
     back = give(host, census(on_road=[A]), RETURN_S)
-    assert node.Announce(topics.VEHICLE_ALIVE, {"vehicle": A}) in back
+    assert node.Announce(topics.VEHICLE_ALIVE, token(A)) in back
     feel(host, A, FRONT, 3, left=True)
     assert give(host, census(), 1.0) == []
     assert vehicles_of(host) == 0
@@ -249,11 +259,11 @@ def test_a_new_bridge_has_new_vehicles_of_the_same_names() -> None:
     host = make_host(shard=Shard(0, 1))
     give(host, node.PeerUp(topics.BRIDGE_ALIVE, {"incarnation": "7"}))
     first = census(A)
-    assert node.Announce(topics.VEHICLE_ALIVE, {"vehicle": A}) in give(host, first)
+    assert node.Announce(topics.VEHICLE_ALIVE, token(A)) in give(host, first)
     assert give(host, first) == []
     gone = give(host, node.PeerUp(topics.BRIDGE_ALIVE, {"incarnation": "8"}))
-    assert node.Withdraw(topics.VEHICLE_ALIVE, {"vehicle": A}) in gone
-    assert node.Announce(topics.VEHICLE_ALIVE, {"vehicle": A}) in give(host, first)
+    assert node.Withdraw(topics.VEHICLE_ALIVE, token(A)) in gone
+    assert node.Announce(topics.VEHICLE_ALIVE, token(A)) in give(host, first)
 
 
 @pytest.mark.parametrize("other", ["6", "ghost", "-1", "x"])
@@ -305,7 +315,7 @@ def test_agents_that_start_later_know_them_and_absurd_parts_change_nothing() -> 
     give(host, node.Started())
     give(host, closed(1.0, 1, 9, -3, bridge=0))
     give(host, closed(2.0, 1, 9, bridge=0))
-    host._start(B, 0.0)
+    host._start(B)
     assert known_to(host, B) == {1}
     for from_m, to_m in ((650.0, 600.0), (900.0, 5000.0), (math.nan, math.nan)):
         give(host, closed(3.0, 1, bridge=0, from_m=from_m, to_m=to_m))
@@ -315,7 +325,7 @@ def test_agents_that_start_later_know_them_and_absurd_parts_change_nothing() -> 
 def test_a_shard_lets_go_of_vehicles_that_the_census_lacks() -> None:
     host = make_host(shard=Shard(0, 1))
     give(host, census(A, B))
-    assert node.Withdraw(topics.VEHICLE_ALIVE, {"vehicle": B}) in give(host, census(A, t_s=2.0))
+    assert node.Withdraw(topics.VEHICLE_ALIVE, token(B)) in give(host, census(A, t_s=2.0))
     assert give(host, census(A, B, t_s=1.0)) == []  # an older one
 
 
@@ -326,9 +336,9 @@ def test_a_shard_accepts_the_census_of_its_own_bridge(other: int) -> None:
     assert give(host, census(A, bridge=7)) == []
     give(host, node.PeerUp(topics.BRIDGE_ALIVE, {"incarnation": "7"}))
     assert give(host, census(B, t_s=9.0, bridge=other)) == []
-    assert node.Announce(topics.VEHICLE_ALIVE, {"vehicle": A}) in give(host, census(A, bridge=7))
+    assert node.Announce(topics.VEHICLE_ALIVE, token(A)) in give(host, census(A, bridge=7))
     # Neither does it make the next one of the right road look old.
-    assert node.Announce(topics.VEHICLE_ALIVE, {"vehicle": C}) in give(host, census(A, C, bridge=7))
+    assert node.Announce(topics.VEHICLE_ALIVE, token(C)) in give(host, census(A, C, bridge=7))
 
 
 def test_stopping_reports_for_every_vehicle() -> None:
@@ -345,6 +355,7 @@ def test_a_shard_takes_announced_vehicles_and_those_on_the_road_once() -> None:
             node.Watch(topics.BRIDGE_ALIVE),
             node.Listen(topics.OBSTACLES),
             node.Listen(topics.CENSUS),
+            *ADDRESSED_TO_IT,
         ]
         assert host.wakeup_s is None
         for _ in range(2):

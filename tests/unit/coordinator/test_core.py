@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterable
 
 import pytest
 from attrs import evolve
@@ -65,6 +66,7 @@ from laneweave.protocol.wire.topics import (
     SERVICE,
     SERVICE_CANCEL,
     STATE,
+    Topic,
 )
 from support.examples import examples
 from support.paper import PAPER
@@ -239,6 +241,30 @@ def test_a_formation_that_has_left_is_forgotten() -> None:
 
 
 # --- from the promise to the plan -------------------------------------------------------------
+
+
+def addressees(effects: Iterable[Effect], topic: Topic) -> list[tuple[str, str]]:
+    """Return process and vehicle of the messages of a topic."""
+    return [
+        (each.parameters["process"], each.parameters["vehicle"])
+        for each in effects
+        if isinstance(each, Send) and each.topic is topic
+    ]
+
+
+def test_messages_go_to_the_processes_that_the_census_names() -> None:
+    """Without any, to one that has the name of the vehicle; the newest census counts."""
+    cells: Cells = {A: (0, 0), B: (-1, 1)}
+    desk = Desk()
+    desk.lead()
+    plain = census(cells, {A: 1, B: 0})
+    at_b = (plain.on_road[0], replace(plain.on_road[1], processes=(Name("f"), Name("g"))))
+    desk.tell(replace(plain, on_road=at_b))
+    assert addressees(desk.observe(cells), PREPARE) == [(A, A), ("f", B), ("g", B)]
+    at_a = (replace(plain.on_road[0], processes=(Name("g"),)), plain.on_road[1])
+    desk.tell(replace(plain, on_road=at_a, t_s=T_S + 0.1))
+    (job,) = jobs(desk.promise(cells))
+    assert addressees(desk.give(run_job(job)), PLAN) == [("g", A), (B, B)]
 
 
 def test_prepare_promise_plan_acceptance() -> None:

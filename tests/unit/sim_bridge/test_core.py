@@ -546,7 +546,7 @@ def test_the_clock_does_not_race_while_the_network_is_away(tmp_path: Path, first
     desk.start(A, B)
     desk.drive_to_entry(A, B)
     news: list[Event] = [LinkDown()]
-    news += [PeerDown(topics.VEHICLE_ALIVE, {"vehicle": name}) for name in (A, B)]
+    news += [PeerDown(topics.VEHICLE_ALIVE, {"process": name, "vehicle": name}) for name in (A, B)]
     for event in news if first == "link" else reversed(news):
         desk.give(event)
     began_s, tick = desk.now_s, desk.core.tick

@@ -20,10 +20,10 @@ from laneweave.coordinator.formations.roster import (
     stage_begin_s,
 )
 from laneweave.coordinator.formations.stages import Stage, stages, where_overtaken, with_queues
-from laneweave.coordinator.operation import LogEntry, to_vehicle
+from laneweave.coordinator.operation import LogEntry, Outcome, ToVehicle
 from laneweave.coordinator.planning.response import PlanFunction
 from laneweave.protocol.road_layout import NO_PARTS, TemporaryClosure, TemporaryParts
-from laneweave.protocol.runtime.node import Compute, Computed, Effect
+from laneweave.protocol.runtime.node import Compute, Computed
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.state_machine import RuleBook
 from laneweave.protocol.wire.events import FORMATIONS_JOINED, PLAN_IN_FORCE, VEHICLES_AWAITED
@@ -123,9 +123,7 @@ class FormationsOperation:
                 return []
         return [] if self._groups.changed else None
 
-    def lead(
-        self, census: Census, t_s: float, now_s: float, *, changed: bool
-    ) -> Iterator[Effect | LogEntry]:
+    def lead(self, census: Census, t_s: float, now_s: float, *, changed: bool) -> Iterator[Outcome]:
         """Update members, handle expired timers, request plans, send messages."""
         if self._planner.leading_since_s is None:
             self._planner.leading_since_s = t_s
@@ -139,7 +137,7 @@ class FormationsOperation:
             if leader.take(PROMISED, now_s):
                 yield from self._planner.order(leader, t_s, now_s)
             for vehicle, message in leader.outgoing(now_s):
-                yield to_vehicle(vehicle, message)
+                yield ToVehicle(vehicle, message)
             if awaited := leader.pop_awaited(now_s):
                 data = {"formation": leader.formation.numbers[0], "vehicles": list(awaited)}
                 yield LogEntry(VEHICLES_AWAITED, data | {"phase": leader.phase.value})

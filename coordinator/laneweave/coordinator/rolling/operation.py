@@ -15,7 +15,7 @@ from functools import partial
 from typing import Any
 
 from laneweave.coordinator.ballots.ballot_round import BallotPhase
-from laneweave.coordinator.operation import LogEntry, to_vehicle
+from laneweave.coordinator.operation import LogEntry, Outcome, ToVehicle
 from laneweave.coordinator.planning.conflict_kinds import Move
 from laneweave.coordinator.planning.rolling.problem import StreamPlan
 from laneweave.coordinator.rolling.checked_planner import Planner
@@ -25,7 +25,7 @@ from laneweave.coordinator.rolling.ownership import ReplacedBallots, partners
 from laneweave.coordinator.rolling.transfer import TRANSFER_RULES, CellTransfer
 from laneweave.protocol.lattice import footprint
 from laneweave.protocol.road_layout import NO_PARTS, TemporaryParts
-from laneweave.protocol.runtime.node import Clock, Compute, Computed, Effect
+from laneweave.protocol.runtime.node import Clock, Compute, Computed
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.formation_table import SNAPSHOT_S
 from laneweave.protocol.state_machine import RuleBook
@@ -154,15 +154,13 @@ class RollingOperation:
             each.plan_from_promises(self.observed.states, now_s)
         return waited
 
-    def lead(
-        self, census: Census, t_s: float, now_s: float, *, changed: bool
-    ) -> Iterator[Effect | LogEntry]:
+    def lead(self, census: Census, t_s: float, now_s: float, *, changed: bool) -> Iterator[Outcome]:
         """Request the plan for the next slot when it is due; send messages."""
         if changed:
             yield from self.on_census(census, now_s)
             yield from self.order(t_s, now_s)
         for vehicle, message in self.outgoing(now_s):
-            yield to_vehicle(vehicle, message)
+            yield ToVehicle(vehicle, message)
 
     def on_census(self, census: Census, now_s: float = 0.0) -> list[LogEntry]:
         """Update the vehicles on the road."""

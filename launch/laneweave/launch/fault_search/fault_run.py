@@ -250,7 +250,7 @@ class FaultRun:
             vehicle = Name(name.removesuffix(TWIN))
             incarnation = partial(self._new_incarnation, vehicle)
             agent = AgentCore(vehicle, incarnation, scenario, LightDriver, rules.vehicle)
-            core = AgentHost(lambda _: agent, incarnation(), scenario.runtime, [vehicle])
+            core = AgentHost(vehicle, lambda _: agent, incarnation(), scenario.runtime, [vehicle])
         self._add(name, core)
 
     def _new_incarnation(self, vehicle: Name) -> int:

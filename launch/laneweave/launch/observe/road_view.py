@@ -108,8 +108,8 @@ class RoadView:
     coordinator_tokens: set[Process] = field(factory=set)
     departed: set[Process] = field(factory=set)
     """Coordinators whose tokens have disappeared."""
-    agent_tokens: set[Name] = field(factory=set)
-    """Vehicles whose agents have tokens."""
+    agent_tokens: dict[Name, set[str]] = field(factory=dict)
+    """Processes with tokens for the agent of each vehicle."""
     bridge_tokens: set[int] = field(factory=set)
     """Incarnations of the bridges with tokens."""
     processes: ProcessView = field(factory=ProcessView)
@@ -260,7 +260,13 @@ class RoadView:
         elif topic is BRIDGE_ALIVE:
             _update(self.bridge_tokens, incarnation_of(parameters), present=up)
         elif topic is VEHICLE_ALIVE:
-            _update(self.agent_tokens, Name(parameters["vehicle"]), present=up)
+            self._on_agent_token(Name(parameters["vehicle"]), parameters["process"], present=up)
+
+    def _on_agent_token(self, vehicle: Name, process: str, *, present: bool) -> None:
+        processes = self.agent_tokens.setdefault(vehicle, set())
+        _update(processes, process, present=present)
+        if not processes:
+            del self.agent_tokens[vehicle]
 
 
 def _update(members: set[Any], member: object, *, present: bool) -> None:

@@ -261,7 +261,7 @@ class SimulatedRun:
         else:
             vehicle = Name(name.removeprefix(AGENT_PREFIX))
             incarnation, runtime = next(self._incarnations), self.scenario.runtime
-            host = AgentHost(self._make_agent, incarnation, runtime, [vehicle])
+            host = AgentHost(vehicle, self._make_agent, incarnation, runtime, [vehicle])
             self._add(name, host, "vehicle", vehicle)
 
     def _add(self, name: str, core: Core, receiver: str, own_name: str) -> None:

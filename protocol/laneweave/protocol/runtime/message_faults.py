@@ -267,7 +267,7 @@ class FaultyCore:
         A message to one of several vehicles in this process is received by that vehicle, any other
         message by all of them.
         """
-        if arrived.topic.addressee is not Party.VEHICLE or self._kind != Party.VEHICLE:
+        if not arrived.topic.addressed or self._kind != Party.VEHICLE:
             return self._receivers
         return frozenset((None, self._kind, arrived.parameters.get("vehicle")))
 

@@ -1,8 +1,9 @@
 """Rights of each process on a secured network, derived from the table of topics.
 
 Each right follows from a row of `topics.TOPICS`: senders may send on keys that contain their name,
-readers may read all keys of the topic, the addressee only keys that contain its name. A router
-checks both directions, so each right has a flow as seen from the router. This module does no I/O.
+readers may read all keys of the topic, processes with agents only those of messages to them. A
+router checks both directions, so each right has a flow as seen from the router. This module does no
+I/O.
 """
 
 from __future__ import annotations
@@ -54,6 +55,8 @@ KNOWN_RULE = (
 REQUEST_MARGIN = 2
 """Factor by which the router's size limit exceeds the service's, so that the service can reject a
 request with a reason."""
+AGENTS = (Party.VEHICLE, Party.FLEET)
+"""Parties whose processes have agents."""
 EVERYWHERE = ("0.0.0.0", "::")  # noqa: S104 (not an address to listen at)
 """Hosts that stand for all interfaces; clients cannot connect to them."""
 
@@ -107,7 +110,7 @@ def rules_of(identity: Identity, scenario: Scenario) -> tuple[Rule, ...]:
     keys = Keys(scenario.network.realm)
     for party, name in _represented(identity, scenario):
         for topic in TOPICS:
-            for right, parameters in rights_on(topic, party, name):
+            for right, parameters in rights_on(topic, party, name, identity.name):
                 allowed.setdefault(right, {})[keys.all_of(topic, **parameters)] = None
     return tuple(Rule(flow, message, tuple(found)) for (flow, message), found in allowed.items())
 
@@ -122,10 +125,20 @@ def _represented(identity: Identity, scenario: Scenario) -> Iterator[tuple[Party
 
 
 def rights_on(
-    topic: Topic, party: Party, name: str
+    topic: Topic, party: Party, name: str, process: str
 ) -> Iterator[tuple[tuple[Flow, str], dict[str, str]]]:
-    """Yield the rights that a topic grants, with the parameters of the keys."""
+    """Yield the rights that a topic grants, with the parameters of the keys.
+
+    Args:
+        topic: the topic.
+        party: party whose rights the process has.
+        name: name that belongs to this party: its own, or that of a vehicle of a fleet.
+        process: name of the process.
+    """
     own = _own(topic, party, name)
+    of_process = {"process": process} if "process" in topic.parameters else {}
+    if not topic.addressed:
+        own |= of_process
     sending, reading = SENDING[topic.exchange], READING[topic.exchange]
     if party == topic.sender or (topic.sender == ANY_SENDER and party in ROLES):
         yield from ((right, own) for right in sending)
@@ -133,8 +146,8 @@ def rights_on(
         yield from ((right, {}) for right in sending)
     if party in topic.readers:
         yield from ((right, {}) for right in reading)
-    if party == topic.addressee:
-        yield from ((right, own) for right in reading)
+    if topic.addressed and party in AGENTS:
+        yield from ((right, of_process) for right in reading)
 
 
 def _own(topic: Topic, party: Party, name: str) -> dict[str, str]:

@@ -5,8 +5,8 @@ raise only `BadInputError`, which names the field.
 
 **Versions.** A release adds fields only at the end of a class and with defaults, so that processes
 of two releases understand each other: fields that an earlier release has not sent take their
-defaults, and fields of a later one are skipped and counted. Any other change raises `VERSION`, and
-processes refuse messages of another version. Named tuples never change.
+defaults, and fields of a later one are skipped and counted. Any other change, also of keys, raises
+`VERSION`, and processes refuse messages of another version. Named tuples never change.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from laneweave.protocol.wire.field_types import Message
 from laneweave.protocol.wire.process_messages import LogEvent
 from laneweave.protocol.wire.topics import TOPICS
 
-VERSION = 2
+VERSION = 3
 """Version of the messages."""
 MAX_BYTES = 1 << 20
 KINDS: dict[str, type[Message]] = {

@@ -381,6 +381,8 @@ class CensusEntry(Message, frozen=True):
     """Type of the vehicle, which determines the moves that it can drive."""
     ready_s: Real = 0.0
     """Road time from which it is in this cell, or almost: it is ready for no plan before [s]."""
+    processes: tuple[Name, ...] = ()
+    """Processes with an agent for it, in keys; empty: one that has the name of the vehicle."""
 
 
 class ClosedFormation(Message, frozen=True):

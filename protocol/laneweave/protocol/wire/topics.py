@@ -95,8 +95,8 @@ class Topic:
     quality: Quality
     readers: tuple[Party, ...] = ()
     """Parties that read all keys of the topic."""
-    addressee: Party | None = None
-    """Party that reads only keys that contain its name."""
+    addressed: bool = False
+    """Whether processes with agents read only the keys that contain their name."""
     deputy: Party | None = None
     """Party that may send on behalf of any sender."""
     exchange: Exchange = Exchange.MESSAGES
@@ -133,9 +133,11 @@ OBSTACLES = Topic(
     "obstacles", "obstacles", obstacle_messages.Obstacles, Party.BRIDGE, Quality.LATEST,
     readers=(Party.COORDINATOR, Party.VEHICLE, Party.FLEET, Party.OBSERVER),
 )  # fmt: skip
+# Messages to vehicles are addressed to the process that has the agent: with one subscription for
+# all its vehicles, neither it nor the router compares each key with an expression for each vehicle.
 SENSE = Topic(
-    "sense", "sense/{vehicle}", messages.Sense, Party.BRIDGE, Quality.LOCKSTEP,
-    addressee=Party.VEHICLE,
+    "sense", "sense/{process}/{vehicle}", messages.Sense, Party.BRIDGE, Quality.LOCKSTEP,
+    addressed=True,
 )  # fmt: skip
 COMMAND = Topic(
     "command", "command/{vehicle}", messages.Command, Party.VEHICLE, Quality.LOCKSTEP,
@@ -154,13 +156,13 @@ MOTION = Topic(
     remark="only vehicles in this stretch of columns and in both adjacent ones",
 )  # fmt: skip
 PREPARE = Topic(
-    "prepare", "prepare/{vehicle}", messages.Prepare, Party.COORDINATOR, Quality.ASSURED,
-    addressee=Party.VEHICLE, readers=(Party.BRIDGE,),
+    "prepare", "prepare/{process}/{vehicle}", messages.Prepare, Party.COORDINATOR, Quality.ASSURED,
+    addressed=True, readers=(Party.BRIDGE,),
     remark="the bridge for vehicles without an agent",
 )  # fmt: skip
 PLAN = Topic(
-    "plan", "plan/{vehicle}", messages.Plan, Party.COORDINATOR, Quality.ASSURED,
-    addressee=Party.VEHICLE, readers=(Party.BRIDGE, Party.OBSERVER),
+    "plan", "plan/{process}/{vehicle}", messages.Plan, Party.COORDINATOR, Quality.ASSURED,
+    addressed=True, readers=(Party.BRIDGE, Party.OBSERVER),
     remark="the bridge for vehicles without an agent",
 )  # fmt: skip
 HEARTBEAT = Topic(
@@ -202,7 +204,7 @@ COORDINATOR_ALIVE = Topic(
     Quality.ASSURED, readers=(Party.COORDINATOR, Party.OBSERVER), exchange=Exchange.TOKENS,
 )  # fmt: skip
 VEHICLE_ALIVE = Topic(
-    "vehicle-alive", "alive/vehicle/{vehicle}", None, Party.VEHICLE, Quality.ASSURED,
+    "vehicle-alive", "alive/vehicle/{process}/{vehicle}", None, Party.VEHICLE, Quality.ASSURED,
     readers=(Party.BRIDGE, Party.OBSERVER), exchange=Exchange.TOKENS,
 )  # fmt: skip
 BRIDGE_ALIVE = Topic(
@@ -268,8 +270,9 @@ class Keys:
         return _read(self.realm, key) if len(key) <= _MAX_KEY else None
 
 
-_MEMO = 1024
-"""Size of the key caches."""
+_MEMO = 1 << 14
+"""Size of the key caches: several keys for each vehicle on the largest roads. In a smaller cache,
+which is filled in turn, no key would ever be found."""
 _MAX_KEY = max(
     len(re.sub(r"{\w+}", "x" * 64, f"{PREFIX}/{{realm}}/{topic.pattern}")) for topic in TOPICS
 )
@@ -339,8 +342,12 @@ def undeclared(key: str) -> str:
 
 def matches(expression: str, key: str) -> bool:
     """Return whether an expression matches a key (`*`: one part; `**`: any number of parts)."""
-    if "*" not in expression:
+    wildcard = expression.find("*")
+    if wildcard < 0:
         return expression == key
+    # Most expressions differ before their first wildcard; compiling a pattern takes much longer.
+    if not key.startswith(expression[: max(wildcard - 1, 0)]):
+        return False
     return _compiled(expression).fullmatch("/" + key) is not None
 
 

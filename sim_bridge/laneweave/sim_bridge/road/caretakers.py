@@ -17,7 +17,7 @@ from laneweave.protocol.vehicle.execution_rules import VEHICLE_RULES
 from laneweave.protocol.vehicle.plan_execution import PlanExecution
 from laneweave.protocol.wire.identities import above
 from laneweave.protocol.wire.messages import Command, Name, Plan, Prepare, VehicleState
-from laneweave.protocol.wire.topics import PLAN, PREPARE, SENSE, STATE, VEHICLE_ALIVE
+from laneweave.protocol.wire.topics import PLAN, PREPARE, STATE, VEHICLE_ALIVE
 from laneweave.sim_bridge.road.tick_answers import Answers
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
 
@@ -114,6 +114,8 @@ class Caretakers:
         self._lease_s = scenario.network.lease_s
         self._new_incarnation = new_incarnation
         self._caretakers: dict[Name, Caretaker] = {}
+        self._processes: dict[Name, dict[Name, None]] = {}
+        """Processes with tokens for the agent of each vehicle."""
         self.departed: dict[Name, tuple[RoadVehicle, int]] = {}
         """Vehicles that have left the road, with the number of remaining notifications."""
         self._absence_counts_s = -math.inf
@@ -134,21 +136,40 @@ class Caretakers:
         """Handle agents' tokens and the state of the bridge's connection; ignore other events."""
         match event:
             case PeerUp(topic, parameters) if topic is VEHICLE_ALIVE:
-                self.answers.agent_up(Name(parameters["vehicle"]))
+                name = Name(parameters["vehicle"])
+                self._processes.setdefault(name, {})[Name(parameters["process"])] = None
+                self.answers.agent_up(name)
             case PeerDown(topic, parameters) if topic is VEHICLE_ALIVE:
-                if self.link_up:
-                    name = Name(parameters["vehicle"])
-                    self.answers.agent_down(name)
-                    self.departed.pop(name, None)
+                self._on_token_down(Name(parameters["vehicle"]), Name(parameters["process"]))
             case LinkUp():
                 self.link_up = True
                 # Other processes reconnect at about the same time.
                 self._absence_counts_s = now_s + self._lease_s
             case LinkDown():
                 self.link_up = False
+                self._processes.clear()
                 self.answers.link_down()
             case _:
                 pass
+
+    def _on_token_down(self, vehicle: Name, process: Name) -> None:
+        processes = self._processes.get(vehicle, {})
+        processes.pop(process, None)
+        if self.link_up and not processes:
+            self._processes.pop(vehicle, None)
+            self.answers.agent_down(vehicle)
+            self.departed.pop(vehicle, None)
+
+    def update_processes(self, vehicle: RoadVehicle) -> bool:
+        """Address messages to the processes with tokens for a vehicle, if there are any.
+
+        Returns:
+            Whether they are others than before.
+        """
+        before, with_tokens = vehicle.processes, tuple(self._processes.get(vehicle.name, ()))
+        if with_tokens:
+            vehicle.processes = with_tokens if with_tokens != (vehicle.name,) else ()
+        return vehicle.processes != before
 
     def register_command(self, vehicle: RoadVehicle, command: Command) -> bool:
         """Register a COMMAND as a sign of life, and store its requests in the controller.
@@ -201,7 +222,7 @@ class Caretakers:
                 del self.departed[name]
                 continue
             self.departed[name] = (vehicle, repeats - 1)
-            yield notify_left(vehicle, tick)
+            yield from vehicle.send_sense(tick, left=True)
 
     # --- caretakers ---------------------------------------------------------------------------
 
@@ -226,8 +247,8 @@ class Caretakers:
     def take_charge(self, vehicle: RoadVehicle, tick: int) -> Iterator[Effect]:
         """Put a caretaker in charge of a vehicle."""
         self._put_caretaker(vehicle, tick)
-        yield Listen(PREPARE, {"vehicle": vehicle.name})
-        yield Listen(PLAN, {"vehicle": vehicle.name})
+        for topic in (PREPARE, PLAN):
+            yield Listen(topic, {"vehicle": vehicle.name})
 
     def begin_anew(self, vehicle: RoadVehicle, tick: int) -> None:
         """Replace the vehicle's caretaker, if it has one: its cells have changed without a plan."""
@@ -254,15 +275,9 @@ class Caretakers:
     def _end_caretaker(self, vehicle: Name) -> Iterator[Effect]:
         """Remove a vehicle's caretaker, if it has one."""
         if self._caretakers.pop(vehicle, None) is not None:
-            yield Unlisten(PREPARE, {"vehicle": vehicle})
-            yield Unlisten(PLAN, {"vehicle": vehicle})
+            for topic in (PREPARE, PLAN):
+                yield Unlisten(topic, {"vehicle": vehicle})
 
 
 def _state_effect(state: VehicleState) -> Effect:
     return Send(STATE, state, {"block": state.block, "vehicle": state.vehicle})
-
-
-def notify_left(vehicle: RoadVehicle, tick: int) -> Effect:
-    """Return the SENSE that makes the agent of a departed vehicle report and stop."""
-    sense = vehicle.sense(tick, caretaker=False, left=True)
-    return Send(SENSE, sense, {"vehicle": vehicle.name})

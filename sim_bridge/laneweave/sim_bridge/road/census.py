@@ -134,6 +134,7 @@ class CensusPublisher:
                     destination=Name(vehicle.admission.arrival.destination),
                     vehicle_type=Name(vehicle.admission.arrival.vehicle_type),
                     ready_s=vehicle.ready_s,
+                    processes=vehicle.processes,
                 )
                 for vehicle in vehicles
             ),

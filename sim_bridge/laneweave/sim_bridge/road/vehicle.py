@@ -8,6 +8,7 @@ from typing import Self
 from attrs import define, evolve, field
 
 from laneweave.protocol.lattice import Cell
+from laneweave.protocol.runtime.node import Effect, Send
 from laneweave.protocol.scenario.deployment_fields import MAX_HOLD_S
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.vehicle_tables import Vehicle
@@ -15,6 +16,7 @@ from laneweave.protocol.vehicle.lane_ends import SOON_S, LaneEnds
 from laneweave.protocol.vehicle.motion import State, cell_state
 from laneweave.protocol.vehicle.sudden_stops import stopping_m
 from laneweave.protocol.wire.messages import ClosedFormation, Command, CurrentMotion, Name, Sense
+from laneweave.protocol.wire.topics import SENSE
 from laneweave.sim_bridge.bodies.command_checks import NEIGHBOURING
 from laneweave.sim_bridge.bodies.motion_controller import (
     FallbackLevel,
@@ -51,6 +53,8 @@ class RoadVehicle:
     """Road time from which a vehicle that has entered more slowly than v_F is in its cell, or
     almost [s]."""
     sense_rate: SenseRate = field(factory=SenseRate)
+    processes: tuple[Name, ...] = ()
+    """Processes with an agent for it, as in `CensusEntry`."""
 
     @classmethod
     def entering(
@@ -236,6 +240,14 @@ class RoadVehicle:
             off_lattice=controller.off_lattice is not None,
             vehicle_type=Name(self.arrival.vehicle_type),
         )
+
+    def send_sense(self, tick: int, *, caretaker: bool = False, left: bool = False) -> list[Effect]:
+        """Return the effects that send the SENSE of a tick to the processes with an agent."""
+        sense = self.sense(tick, caretaker=caretaker, left=left)
+        return [
+            Send(SENSE, sense, {"process": process, "vehicle": self.name})
+            for process in self.processes or (self.name,)
+        ]
 
     @property
     def _situation(self) -> Situation:

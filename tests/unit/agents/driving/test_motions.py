@@ -104,7 +104,11 @@ A, B, C = Name("A"), Name("B"), Name("C")
 def host_of(*vehicles: Name) -> AgentHost:
     Listener.heard = {}
     return AgentHost(
-        lambda name: AgentCore(name, lambda: 1, SCENARIO, Listener), 1, SCENARIO.runtime, vehicles
+        Name("p"),
+        lambda name: AgentCore(name, lambda: 1, SCENARIO, Listener),
+        1,
+        SCENARIO.runtime,
+        vehicles,
     )
 
 

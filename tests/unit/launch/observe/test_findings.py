@@ -15,6 +15,7 @@ from laneweave.protocol.config.scenario_files import load_scenario, parse_scenar
 from laneweave.protocol.runtime.transport import LinkDown
 from laneweave.protocol.scenario.common_settings import settings_of
 from laneweave.protocol.scenario.deployment_fields import Shard
+from laneweave.protocol.wire.codec import VERSION
 from laneweave.protocol.wire.common_settings import CommonSettings
 from laneweave.protocol.wire.identities import Identity
 from laneweave.protocol.wire.messages import Ballot, ClosedFormation, Name
@@ -108,7 +109,7 @@ def _happens(listener: Listener, rule: str) -> None:  # noqa: C901 (a table)
         case "overlap":
             listener.road_status(1.9, overlaps=2)
         case "other-version":
-            listener.view.update(OtherVersion("fleet b", 3), 1.0)
+            listener.view.update(OtherVersion("fleet b", VERSION + 1), 1.0)
         case "no-bridge":
             listener.bridge(up=False)
         case "several-bridges":
@@ -129,7 +130,7 @@ def _happens(listener: Listener, rule: str) -> None:  # noqa: C901 (a table)
             listener.coordinator("c2", up=False)
         case "fleet-missing":
             listener.fleet("b", "1-of-2", OWN, up=False)
-            listener.view.agent_tokens.discard(Name(IN_B))
+            listener.view.agent_tokens.pop(Name(IN_B))
         case "road-stands":
             listener.road_status(1.9, standing_s=7.0, awaited=(Name("v0005"),))
         case "unattended":
@@ -146,7 +147,9 @@ def _happens(listener: Listener, rule: str) -> None:  # noqa: C901 (a table)
 CASES = [
     Case("link-lost", "router", "the connection to the router was lost"),
     Case("overlap", "bridge", "bodies have overlapped: 2 pairs"),
-    Case("other-version", "fleet b", "messages of fleet b have version 3, not 2"),
+    Case(
+        "other-version", "fleet b", f"messages of fleet b have version {VERSION + 1}, not {VERSION}"
+    ),
     Case("no-bridge", "bridge", "the bridge disappeared at 120.0 s, before the end of its road"),
     Case("several-bridges", "bridge", "2 bridges are in this realm"),
     Case("clock-off", "bridge", "the clock of the bridge is 72 h ahead of that of this host"),
@@ -281,7 +284,7 @@ def test_a_condition_must_last_unless_it_was_so_all_the_time() -> None:
 
     assert look(2.0) == []
     listener.fleet("b", "1-of-2", OWN, up=False)
-    listener.view.agent_tokens.discard(Name(IN_B))
+    listener.view.agent_tokens.pop(Name(IN_B))
     assert look(3.0) == look(3.5) == look(3.6, last=True) == []
     (finding,) = look(4.1)
     assert finding.for_s == pytest.approx(1.1)
@@ -296,7 +299,7 @@ def test_a_condition_must_last_unless_it_was_so_all_the_time() -> None:
 def test_shards_that_no_file_names_follow_from_those_that_are_there() -> None:
     listener = healthy()
     listener.fleet("b", "1-of-2", OWN, up=False)
-    listener.view.agent_tokens.discard(Name(IN_B))
+    listener.view.agent_tokens.pop(Name(IN_B))
     expected = evolve(EXPECTED, fleets={})
     assert rules(found(listener, expected=expected)) == [("fleet-missing", "fleet 1-of-2")]
 

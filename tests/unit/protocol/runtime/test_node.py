@@ -118,8 +118,8 @@ def bench() -> Bench:
             QueryArrived(4, b"q"),
         ),
         (
-            TokenUp("laneweave/r/alive/vehicle/v1"),
-            PeerUp(topics.VEHICLE_ALIVE, {"vehicle": "v1"}),
+            TokenUp("laneweave/r/alive/vehicle/p/v1"),
+            PeerUp(topics.VEHICLE_ALIVE, {"process": "p", "vehicle": "v1"}),
         ),
         (
             TokenDown("laneweave/r/alive/coordinator/c1/17"),
@@ -206,7 +206,7 @@ def test_an_unknown_topic_is_counted(bench: Bench, key: str) -> None:
     assert bench.core.events == []
 
 
-@pytest.mark.parametrize("key", ["laneweave/r/alive/vehicle/v1", "laneweave/r/service/plan"])
+@pytest.mark.parametrize("key", ["laneweave/r/alive/vehicle/p/v1", "laneweave/r/service/plan"])
 def test_a_message_on_a_topic_without_messages_is_counted(bench: Bench, key: str) -> None:
     bench.node.deliver(Received(key, encode(BEAT)), 1.0)
     assert bench.node.rejected == 1
@@ -222,8 +222,8 @@ def test_effects_reach_the_transport(bench: Bench) -> None:
         Listen(topics.STATE, {"block": 3}),
         Listen(topics.CENSUS),
         Unlisten(topics.STATE, {"block": 3}),
-        Announce(topics.VEHICLE_ALIVE, {"vehicle": "v1"}),
-        Withdraw(topics.VEHICLE_ALIVE, {"vehicle": "v1"}),
+        Announce(topics.VEHICLE_ALIVE, {"process": "p", "vehicle": "v1"}),
+        Withdraw(topics.VEHICLE_ALIVE, {"process": "p", "vehicle": "v1"}),
         Watch(topics.VEHICLE_ALIVE),
         Serve(topics.SERVICE),
         Reply(5, b"a"),
@@ -237,9 +237,9 @@ def test_effects_reach_the_transport(bench: Bench) -> None:
         call.subscribe("laneweave/r/state/3/*"),
         call.subscribe("laneweave/r/census"),
         call.unsubscribe("laneweave/r/state/3/*"),
-        call.announce("laneweave/r/alive/vehicle/v1"),
-        call.withdraw("laneweave/r/alive/vehicle/v1"),
-        call.watch("laneweave/r/alive/vehicle/*"),
+        call.announce("laneweave/r/alive/vehicle/p/v1"),
+        call.withdraw("laneweave/r/alive/vehicle/p/v1"),
+        call.watch("laneweave/r/alive/vehicle/*/*"),
         call.serve("laneweave/r/service/plan"),
         call.answer(5, b"a", ok=True, encoding=""),
         call.answer(6, b"e", ok=False, encoding="application/json"),

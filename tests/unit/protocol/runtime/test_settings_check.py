@@ -44,7 +44,7 @@ OTHER = settings_of(parse_scenario({"formation": {"gap_m": 20.0}}))
 FITS, DIFFERS, UNKNOWN = 5, 7, 9
 """Incarnations of bridges; the last one is of the release before, and declares no settings."""
 SETTINGS_OF = {FITS: OWN, DIFFERS: OTHER}
-TOKEN = Announce(VEHICLE_ALIVE, {"vehicle": "v1"})
+TOKEN = Announce(VEHICLE_ALIVE, {"process": "v1", "vehicle": "v1"})
 
 
 @define

@@ -71,12 +71,15 @@ def may_read(who: str, key: str) -> bool:
     [
         ("clock", "bridge", "bridge c1 c2 watch"),
         ("census", "bridge", "c1 c2 two watch"),
-        ("sense/a", "bridge", "a two"),
+        ("sense/a/a", "bridge", "a"),
+        ("sense/two/a", "bridge", "two"),
         ("command/a", "a two", "bridge"),
         ("state/7/a", "a bridge two", "a b c c1 c2 two watch"),
         ("motion/-7/a", "a two", "a b c two watch"),
-        ("prepare/a", "c1 c2", "a bridge two"),
-        ("plan/a", "c1 c2", "a bridge two watch"),
+        ("prepare/a/a", "c1 c2", "a bridge"),
+        ("prepare/two/a", "c1 c2", "bridge two"),
+        ("plan/a/a", "c1 c2", "a bridge watch"),
+        ("plan/two/a", "c1 c2", "bridge two watch"),
         ("heartbeat/c1", "c1", "bridge c1 c2 watch"),
         ("report/agent/a", "a two", "bridge watch"),
         ("report/coordinator/c1", "c1", "bridge watch"),
@@ -98,13 +101,15 @@ def test_who_sends_and_who_reads(key: str, senders: str, readers: str) -> None:
 
 def test_tokens_and_the_service() -> None:
     shows, watches, asks = "liveliness_token", "declare_liveliness_subscriber", "query"
-    assert may("vehicle.a", "ingress", shows, "alive/vehicle/a")
-    assert not may("vehicle.a", "ingress", shows, "alive/vehicle/b")
+    assert may("vehicle.a", "ingress", shows, "alive/vehicle/a/a")
+    assert may("fleet.two", "ingress", shows, "alive/vehicle/two/a")
+    for who, key in (("vehicle.a", "a/b"), ("vehicle.a", "b/a"), ("fleet.two", "a/a")):
+        assert not may(who, "ingress", shows, f"alive/vehicle/{key}")
     assert may("coordinator.c1", "ingress", shows, "alive/coordinator/c1/77")
     assert not may("coordinator.c1", "ingress", shows, "alive/coordinator/c2/77")
-    assert may("bridge", "ingress", watches, "alive/vehicle/a")
+    assert may("bridge", "ingress", watches, "alive/vehicle/a/a")
     assert may("vehicle.a", "egress", shows, "alive/bridge/5")
-    assert not may("client.plan", "ingress", watches, "alive/vehicle/a")
+    assert not may("client.plan", "ingress", watches, "alive/vehicle/a/a")
     assert may("client.plan", "ingress", asks, "service/plan")
     assert may("client.plan", "egress", "reply", "service/plan")
     assert may("coordinator.c1", "ingress", "declare_queryable", "service/plan")
@@ -143,21 +148,26 @@ def test_every_topic_has_senders_and_readers() -> None:
     parties = set(Party)
     for topic in TOPICS:
         assert topic.sender in {*parties, "any"}, topic.name
-        assert {*topic.readers, *filter(None, (topic.addressee, topic.deputy))} <= parties
-        assert topic.readers or topic.addressee, topic.name
+        assert {*topic.readers, *filter(None, (topic.deputy,))} <= parties
+        assert topic.readers or topic.addressed, topic.name
         # Whom a key names is among its parameters.
-        assert not topic.addressee or topic.addressee in topic.parameters
+        assert not topic.addressed or topic.parameters == ("process", "vehicle")
 
 
 def test_the_rights_of_a_fleet_are_those_of_its_vehicles_and_the_census() -> None:
     def rights(who: str) -> set[tuple[Flow, str, str]]:
         return {(rule.flow, rule.message, key) for rule in rules(who) for key in rule.keys}
 
-    more = rights("fleet.two") - rights("vehicle.a") - rights("vehicle.b")
+    def addressed(who: str, *vehicles: str) -> set[str]:
+        keys = [f"{topic}/{who}/*" for topic in ("sense", "prepare", "plan")]
+        return {*keys, *(f"alive/vehicle/{who}/{vehicle}" for vehicle in vehicles)}
+
+    single, fleet = rights("vehicle.a") | rights("vehicle.b"), rights("fleet.two")
     own_keys = ("alive/process/fleet/two/*/*/*", "settings/fleet/two", "report/fleet/two")
-    expected = ("census", *own_keys, "event/fleet/two")
-    assert {key for _, _, key in more} == {PREFIX + key for key in expected}
-    assert rights("vehicle.a") | rights("vehicle.b") < rights("fleet.two")
+    expected = {"census", *own_keys, "event/fleet/two"} | addressed("two", "a", "b")
+    assert {key for _, _, key in fleet - single} == {PREFIX + key for key in expected}
+    not_its_own = addressed("a", "a") | addressed("b", "b")
+    assert {key for _, _, key in single - fleet} == {PREFIX + key for key in not_its_own}
     even, odd = rights("fleet.even"), rights("fleet.odd")
     own = {key for _, _, key in even & odd if "v0" in key}
     assert not own

@@ -57,7 +57,7 @@ def beat_key(name: str) -> str:
 
 
 def token_key(name: str) -> str:
-    return KEYS.key(VEHICLE_ALIVE, vehicle=name)
+    return KEYS.key(VEHICLE_ALIVE, process=name, vehicle=name)
 
 
 FLOW = beat_key("flow")
@@ -144,7 +144,10 @@ class SimulatedBed:
     def join_process(self, name: str) -> None:
         """Add a participant in its own process that serves and shows the token of its name."""
         core = Recorder(
-            first=(node.Serve(SERVICE), node.Announce(VEHICLE_ALIVE, {"vehicle": name}))
+            first=(
+                node.Serve(SERVICE),
+                node.Announce(VEHICLE_ALIVE, {"process": name, "vehicle": name}),
+            )
         )
         self.network.add(name, core, REALM)
         self.network.run(self.network.now_s)
@@ -756,7 +759,7 @@ class Errand:
                 yield node.Listen(HEARTBEAT)
                 yield node.Watch(VEHICLE_ALIVE)
                 yield node.Serve(SERVICE)
-                yield node.Announce(VEHICLE_ALIVE, {"vehicle": "errand"})
+                yield node.Announce(VEHICLE_ALIVE, {"process": "errand", "vehicle": "errand"})
                 self.wakeup_s = now_s + 0.05
             case node.Wakeup():
                 self.wakeup_s = None

@@ -187,7 +187,7 @@ def test_an_int_is_taken_where_a_number_is_meant() -> None:
 
 
 BEAT = envelope(SAMPLES[Heartbeat])[2]
-VERSIONS: list[object] = [0, 1, 3, -1, "1", None, True, 1.0, [1], {}, b"1", 2**64 - 1]
+VERSIONS: list[object] = [0, 1, 2, 4, -1, "1", None, True, 1.0, [1], {}, b"1", 2**64 - 1]
 NO_KINDS: list[object] = [
     "Hearbeat", "heartbeat", "", "object", "Ballot", "Neighbour", 1, None, [], {}, b"Plan"
 ]  # fmt: skip
@@ -200,15 +200,15 @@ WRONG_ENVELOPES: list[tuple[object, str]] = [
     ),
     *(
         (whole, "message")
-        for whole in (None, 1, "Plan", {}, [], [1], [2, "Plan"], [2, "Plan", [], []],
-                      {"0": 2, "1": "Plan"})
+        for whole in (None, 1, "Plan", {}, [], [1], [VERSION, "Plan"], [VERSION, "Plan", [], []],
+                      {"0": VERSION, "1": "Plan"})
     ),
 ]  # fmt: skip
 
 
 @for_each(("whole", "field"), WRONG_ENVELOPES)
 def test_a_wrong_envelope_is_refused_by_its_part(whole: object, field: str) -> None:
-    assert VERSION == 2
+    assert VERSION == 3
     packed: bytes = msgpack.packb(whole)
     assert refusal(decode, packed).field == field
 

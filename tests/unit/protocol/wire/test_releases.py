@@ -1,6 +1,7 @@
 """Messages of earlier releases, kept as files: this release reads them.
 
-`releases/` has the messages of the last state before the one in which processes compared settings.
+`releases/` has the messages of the first state in which messages are addressed to processes, which
+gave them the version 3.
 """
 
 from __future__ import annotations

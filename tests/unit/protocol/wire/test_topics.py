@@ -114,7 +114,7 @@ def test_what_is_no_key_part_is_refused(part: str) -> None:
 
 def test_expressions_leave_parameters_open() -> None:
     assert KEYS.all_of(topics.CLOCK) == "laneweave/r-1/clock"
-    assert KEYS.all_of(topics.VEHICLE_ALIVE) == "laneweave/r-1/alive/vehicle/*"
+    assert KEYS.all_of(topics.VEHICLE_ALIVE) == "laneweave/r-1/alive/vehicle/*/*"
     assert KEYS.key(topics.STATE, block=2, vehicle="*") == "laneweave/r-1/state/2/*"
 
 

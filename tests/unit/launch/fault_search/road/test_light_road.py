@@ -29,7 +29,7 @@ from laneweave.protocol.wire.topics import COMMAND, VEHICLE_ALIVE
 
 SCENARIO = RoadSetup(lanes=3).make_scenario()
 A = Name("a")
-OWN = {"vehicle": "a"}
+OWN = {"process": "a", "vehicle": "a"}
 
 
 class Bench:

@@ -370,7 +370,9 @@ def test_news_of_a_token_never_overtake_each_other(seed: int) -> None:
     watcher = listener()
     network = network_of(Conditions(jitter_s=0.05), seed=seed, a=watcher, v=Recorder())
     for _ in range(5):
-        perform(network, "v", token("v"), node.Withdraw(VEHICLE_ALIVE, {"vehicle": "v"}))
+        perform(
+            network, "v", token("v"), node.Withdraw(VEHICLE_ALIVE, {"process": "v", "vehicle": "v"})
+        )
     perform(network, "v", token("v"))
     network.run(1.0)
     assert watcher.tokens == ["+v", "-v"] * 5 + ["+v"]
