@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,7 @@ from laneweave.protocol.wire.messages import (
     RoadClock,
     Sense,
     VehicleState,
+    addresses_of,
 )
 from laneweave.protocol.wire.process_messages import Report
 from laneweave.protocol.wire.topics import (
@@ -136,8 +138,8 @@ class Forger:
                 self.victim = candidates[-1]
                 self._of_victim.clear()
             # With a certificate, a vehicle may read only this key.
-            for transport in self._transports:
-                transport.subscribe(self._keys.key(SENSE, process=self, vehicle=self.victim))
+            for transport, process in product(self._transports, self._addresses()):
+                transport.subscribe(self._keys.key(SENSE, process=process, vehicle=self.victim))
         return bool(candidates) and len(self._of_victim) == len(OF_VEHICLE)
 
     def keep_victim(self) -> None:
@@ -166,7 +168,19 @@ class Forger:
         self._transports[0].publish(key, payload, Quality.ASSURED)
 
     def to_victim(self, topic: Topic, message: object) -> None:
-        self.publish(topic, message, vehicle=self.victim)
+        """Publish a message to the victim or, if it is addressed to none, in its name."""
+        if not topic.addressed:
+            self.publish(topic, message, vehicle=self.victim)
+            return
+        for process in self._addresses():
+            self.publish(topic, message, process=process, vehicle=self.victim)
+
+    def _addresses(self) -> tuple[Name, ...]:
+        """Return the processes with an agent for the victim."""
+        assert self.victim is not None
+        on_road = self.known(Census).on_road
+        processes = {entry.vehicle: entry.processes for entry in on_road}
+        return addresses_of(self.victim, processes.get(self.victim, ()))
 
     def change(self, topic: Topic, **changes: object) -> None:
         """Publish a message of the road with some fields changed."""

@@ -57,6 +57,7 @@ from laneweave.protocol.wire.messages import (
     Plan,
     RoadClock,
     VehicleState,
+    addresses_of,
 )
 from laneweave.protocol.wire.newest import NewestRoad
 from laneweave.protocol.wire.obstacle_messages import Obstacles
@@ -446,7 +447,7 @@ class CoordinatorCore:
                     yield self._log(kind, **data)
                 case ToVehicle(vehicle, message):
                     topic = PLAN if isinstance(message, Plan) else PREPARE
-                    for process in self._processes_of.get(vehicle) or (vehicle,):
+                    for process in addresses_of(vehicle, self._processes_of.get(vehicle, ())):
                         yield Send(topic, message, {"process": process, "vehicle": vehicle})
                 case _:
                     yield outcome

@@ -11,6 +11,7 @@ from laneweave.protocol.runtime.node import Effect, Send
 from laneweave.protocol.runtime.transport import LinkDown, LinkUp
 from laneweave.protocol.wire.messages import Census, Name, Sense
 from laneweave.sim_bridge.core import TickPhase
+from laneweave.sim_bridge.road.caretakers import MAX_PROCESSES
 from support.bridge_bench import TWO, A, B, Desk, make_scenario
 from support.states import sent
 
@@ -93,18 +94,53 @@ def test_the_last_process_is_still_addressed_after_its_token_has_vanished(desk: 
     assert addressees(next_tick(desk), A) == [G]
 
 
+@pytest.mark.parametrize("order", ["link first", "tokens first", "link last"])
 @pytest.mark.parametrize("stays", [False, True])
-def test_after_a_lost_link_only_tokens_that_appear_again_count(desk: Desk, stays: bool) -> None:
+def test_after_a_lost_link_only_tokens_that_appear_again_count(
+    desk: Desk, order: str, *, stays: bool
+) -> None:
+    """In whichever order the events arrive: link and tokens have threads of their own."""
     desk.up(A, F)
     desk.up(A, G)
     next_tick(desk)
-    desk.give(LinkDown())
+    if order == "link first":
+        desk.give(LinkDown())
     desk.down(A, F)
     desk.down(A, G)
-    desk.give(LinkUp())
+    if order == "tokens first":
+        desk.give(LinkDown())
+    if order != "link last":
+        desk.give(LinkUp())
     for process in (F, G) if stays else (G,):
         desk.up(A, process)
+    if order == "link last":
+        desk.give(LinkDown())
+        desk.give(LinkUp())
     assert addressees(next_tick(desk), A) == ([F, G] if stays else [G])
+
+
+def test_a_vehicle_that_enters_after_a_lost_link_is_addressed_by_its_token(tmp_path: Path) -> None:
+    desk = Desk(make_scenario(), tmp_path, TWO)
+    desk.start(B)
+    desk.up(A, F)
+    desk.down(A, F)
+    desk.up(A, F)
+    desk.give(LinkDown())
+    desk.give(LinkUp())
+    desk.up(B)
+    desk.drive_to_entry(A, B)
+    assert set(addressees(desk.effects, A)) == {F}
+
+
+def test_a_vehicle_is_addressed_in_few_processes(desk: Desk) -> None:
+    """Tokens may be forged; those that appeared last count."""
+    names = [f"p{number}" for number in range(3 * MAX_PROCESSES)]
+    for name in names:
+        desk.up(A, name)
+    assert addressees(next_tick(desk), A) == names[-MAX_PROCESSES:]
+    for name in names[1:]:
+        desk.down(A, name)
+    assert addressees(next_tick(desk), A) == names[:1]
 
 
 def test_a_departed_vehicle_is_reported_to_the_process_with_its_agent(desk: Desk) -> None:
@@ -113,6 +149,13 @@ def test_a_departed_vehicle_is_reported_to_the_process_with_its_agent(desk: Desk
     desk.drive(lambda: desk.core.phase is TickPhase.SHUTTING_DOWN)
     assert any(sense.left for sense in sent(desk.effects, Sense) if sense.vehicle == A)
     assert set(addressees(desk.effects, A)) == {F}
+    desk.up(A, G)
+    desk.effects.clear()
+    list(desk.core.road.caretakers.notify_departed(desk.core.tick))
+    (notice, *_) = desk.core.road.caretakers.notify_departed(desk.core.tick)
+    assert isinstance(notice, Send)
+    assert notice.parameters["process"] == F
     desk.down(A, F)
+    desk.down(A, G)
     assert A not in desk.core.road.caretakers.departed
     assert not desk.core.road.caretakers._processes

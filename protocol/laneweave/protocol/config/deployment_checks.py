@@ -2,7 +2,13 @@
 
 from __future__ import annotations
 
-from laneweave.protocol.config.participants import identities_of, max_vehicles
+from itertools import chain
+
+from laneweave.protocol.config.participants import (
+    demanded_vehicles,
+    identities_of,
+    max_vehicles,
+)
 from laneweave.protocol.config.rules import compare, require
 from laneweave.protocol.errors import BadInputError, raise_all
 from laneweave.protocol.field_validators import host_of, is_encrypted
@@ -47,6 +53,18 @@ def check_sumo(scenario: Scenario) -> None:
     require(not formation.change_columns, "formation.change_columns", True, allowed)
 
 
+def _check_fleet_names(scenario: Scenario) -> None:
+    """Check that no fleet has the name of a vehicle: it could read messages to that vehicle."""
+    security = scenario.security
+    listed = (members for members in security.fleets.values() if not isinstance(members, str))
+    vehicles = {*security.vehicles, *demanded_vehicles(scenario), *chain.from_iterable(listed)}
+    raise_all(
+        BadInputError(f"security.fleets[{name}]", name, "a name that no vehicle has")
+        for name in security.fleets
+        if name in vehicles
+    )
+
+
 def check_security(scenario: Scenario) -> None:
     """Check that endpoints suit access control, and that certificates can name all vehicles."""
     network, security = scenario.network, scenario.security
@@ -70,6 +88,7 @@ def check_security(scenario: Scenario) -> None:
     is_ipv6 = ":" in host_of(network.endpoint)
     require(not is_ipv6, "network.endpoint", network.endpoint, allowed)
     require(bool(security.folder), "security.folder", "", "the folder of the certificates")
+    _check_fleet_names(scenario)
     count = max_vehicles(scenario)
     require(
         count <= MAX_SECURED_VEHICLES,

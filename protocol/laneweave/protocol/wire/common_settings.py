@@ -19,6 +19,7 @@ from typing import Final
 
 from attrs import field, frozen
 
+from laneweave.protocol.wire.codec import VERSION
 from laneweave.protocol.wire.topics import ROLES, Party
 
 GROUPS: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
@@ -143,4 +144,5 @@ def _of_group(values: Mapping[str, str], group: str) -> dict[str, str]:
 
 
 def _digest(values: Mapping[str, str], group: str) -> int:
-    return zlib.crc32(json.dumps(_of_group(values, group), sort_keys=True).encode())
+    # Processes with another version of the messages do not fit either.
+    return zlib.crc32(json.dumps([VERSION, _of_group(values, group)], sort_keys=True).encode())

@@ -382,7 +382,15 @@ class CensusEntry(Message, frozen=True):
     ready_s: Real = 0.0
     """Road time from which it is in this cell, or almost: it is ready for no plan before [s]."""
     processes: tuple[Name, ...] = ()
-    """Processes with an agent for it, in keys; empty: one that has the name of the vehicle."""
+    """Processes with an agent for it, as keys name them; empty: see `addresses_of`."""
+
+
+def addresses_of(vehicle: Name, processes: tuple[Name, ...]) -> tuple[Name, ...]:
+    """Return the processes to which messages to a vehicle are addressed.
+
+    `processes` are those with an agent for it; without any, one with the name of the vehicle.
+    """
+    return processes or (vehicle,)
 
 
 class ClosedFormation(Message, frozen=True):

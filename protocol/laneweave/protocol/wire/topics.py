@@ -96,7 +96,8 @@ class Topic:
     readers: tuple[Party, ...] = ()
     """Parties that read all keys of the topic."""
     addressed: bool = False
-    """Whether processes with agents read only the keys that contain their name."""
+    """Whether the keys name the process that they are for: processes with agents read only their
+    own."""
     deputy: Party | None = None
     """Party that may send on behalf of any sender."""
     exchange: Exchange = Exchange.MESSAGES
@@ -270,9 +271,9 @@ class Keys:
         return _read(self.realm, key) if len(key) <= _MAX_KEY else None
 
 
-_MEMO = 1 << 14
-"""Size of the key caches: several keys for each vehicle on the largest roads. In a smaller cache,
-which is filled in turn, no key would ever be found."""
+_MEMO, _MEMO_PATTERNS = 1 << 13, 1 << 10
+"""Sizes of the caches of keys and of compiled expressions. A process has several keys for each
+vehicle on the road, in turn: in a cache with room for fewer, no key would ever be found."""
 _MAX_KEY = max(
     len(re.sub(r"{\w+}", "x" * 64, f"{PREFIX}/{{realm}}/{topic.pattern}")) for topic in TOPICS
 )
@@ -351,7 +352,7 @@ def matches(expression: str, key: str) -> bool:
     return _compiled(expression).fullmatch("/" + key) is not None
 
 
-@lru_cache(maxsize=_MEMO)
+@lru_cache(maxsize=_MEMO_PATTERNS)
 def _compiled(expression: str) -> re.Pattern[str]:
     """Return a pattern for matching keys with a leading slash."""
     wild = {"*": "/[^/]*", "**": "(?:/[^/]*)*"}

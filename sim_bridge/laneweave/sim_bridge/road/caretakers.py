@@ -21,6 +21,9 @@ from laneweave.protocol.wire.topics import PLAN, PREPARE, STATE, VEHICLE_ALIVE
 from laneweave.sim_bridge.road.tick_answers import Answers
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
 
+MAX_PROCESSES = 4
+"""Maximum number of processes to which messages to a vehicle are addressed, those with the newest
+tokens: a token may be forged."""
 LEFT_REPEATS = 20
 """Number of ticks at which the agent of a departed vehicle is notified."""
 
@@ -147,7 +150,6 @@ class Caretakers:
                 self._absence_counts_s = now_s + self._lease_s
             case LinkDown():
                 self.link_up = False
-                self._processes.clear()
                 self.answers.link_down()
             case _:
                 pass
@@ -155,8 +157,10 @@ class Caretakers:
     def _on_token_down(self, vehicle: Name, process: Name) -> None:
         processes = self._processes.get(vehicle, {})
         processes.pop(process, None)
-        if self.link_up and not processes:
-            self._processes.pop(vehicle, None)
+        if processes:
+            return
+        self._processes.pop(vehicle, None)
+        if self.link_up:
             self.answers.agent_down(vehicle)
             self.departed.pop(vehicle, None)
 
@@ -168,7 +172,9 @@ class Caretakers:
         """
         before, with_tokens = vehicle.processes, tuple(self._processes.get(vehicle.name, ()))
         if with_tokens:
-            vehicle.processes = with_tokens if with_tokens != (vehicle.name,) else ()
+            # One with the name of the vehicle is not named; see `CensusEntry`.
+            newest = with_tokens[-MAX_PROCESSES:]
+            vehicle.processes = newest if newest != (vehicle.name,) else ()
         return vehicle.processes != before
 
     def register_command(self, vehicle: RoadVehicle, command: Command) -> bool:
@@ -222,6 +228,7 @@ class Caretakers:
                 del self.departed[name]
                 continue
             self.departed[name] = (vehicle, repeats - 1)
+            self.update_processes(vehicle)
             yield from vehicle.send_sense(tick, left=True)
 
     # --- caretakers ---------------------------------------------------------------------------

@@ -15,7 +15,14 @@ from laneweave.protocol.scenario.vehicle_tables import Vehicle
 from laneweave.protocol.vehicle.lane_ends import SOON_S, LaneEnds
 from laneweave.protocol.vehicle.motion import State, cell_state
 from laneweave.protocol.vehicle.sudden_stops import stopping_m
-from laneweave.protocol.wire.messages import ClosedFormation, Command, CurrentMotion, Name, Sense
+from laneweave.protocol.wire.messages import (
+    ClosedFormation,
+    Command,
+    CurrentMotion,
+    Name,
+    Sense,
+    addresses_of,
+)
 from laneweave.protocol.wire.topics import SENSE
 from laneweave.sim_bridge.bodies.command_checks import NEIGHBOURING
 from laneweave.sim_bridge.bodies.motion_controller import (
@@ -246,7 +253,7 @@ class RoadVehicle:
         sense = self.sense(tick, caretaker=caretaker, left=left)
         return [
             Send(SENSE, sense, {"process": process, "vehicle": self.name})
-            for process in self.processes or (self.name,)
+            for process in addresses_of(self.name, self.processes)
         ]
 
     @property

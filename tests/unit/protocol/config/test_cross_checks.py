@@ -84,6 +84,11 @@ MISFITS: list[tuple[str, dict[str, Any]]] = [
     ("security.mode", {"network": {"listen": ["tls/r:7447"]}}),
     ("demand.duration_s", MTLS | {"demand": {"duration_s": 80_000.0}}),
     ("security.clients", MTLS | {"security": {"mode": "mtls", "clients": ["x" * 58]}}),
+    (
+        "security.fleets[a]",
+        MTLS | {"security": {"mode": "mtls", "fleets": {"a": ["b"], "f": ["a"]}}},
+    ),
+    ("security.fleets[v0001]", MTLS | {"security": {"mode": "mtls", "fleets": {"v0001": "0/1"}}}),
     ("security.folder", MTLS | {"security": {"mode": "mtls", "folder": ""}}),
     ("network.endpoint", MTLS | {"network": {"endpoint": "tls/[::1]:7447"}}),
     ("network.endpoint", MTLS | {"network": {"endpoint": "quic/[2001:db8::1]:7447"}}),
