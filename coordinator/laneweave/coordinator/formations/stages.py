@@ -41,6 +41,8 @@ QUEUE_M = 10.0
 """Queue lengths at stop lines are rounded up to multiples of this."""
 MAX_OVERTAKING_S = 25.0
 """Maximum time for which a formation leaves a lane to others; slower ones drive behind it."""
+MAX_GOALS = 256
+"""Maximum number of lanes and destinations for which a stage remembers the goal lanes."""
 LEFT_M = 1.0
 """Length of a lane that is left behind the last part that a formation leaves to others, and minimum
 length of such a part."""
@@ -120,12 +122,27 @@ class Stage:
     def _open_until(self) -> tuple[object, ...]:
         return self.to_m, self.is_last, self.structure, self.lanes, self.through_lanes
 
+    @cached_property
+    def _goals(self) -> dict[tuple[int, str], frozenset[int]]:
+        """Goal lanes that have been determined, by preferred lane and destination."""
+        return {}
+
     def goal_lanes(self, preferred_lane: int, destination: str = END_OF_ROAD) -> frozenset[int]:
         """Return the lanes in one of which a vehicle should be at the end of the stage.
 
         A vehicle that can no longer change to the lane of its exit drives to the end of the road,
         unless it is in that lane.
         """
+        known = self._goals.get((preferred_lane, destination))
+        if known is None:
+            if len(self._goals) >= MAX_GOALS:
+                self._goals.clear()
+            known = self._goals[preferred_lane, destination] = self._goal_lanes(
+                preferred_lane, destination
+            )
+        return known
+
+    def _goal_lanes(self, preferred_lane: int, destination: str) -> frozenset[int]:
         if self.avoids:
             return self.through_lanes
         serving = self._serving(preferred_lane, destination)

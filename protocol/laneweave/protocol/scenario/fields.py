@@ -41,7 +41,7 @@ from laneweave.protocol.scenario.vehicle_types import VehicleTypes
 SCHEMA = "laneweave.scenario/1"
 
 
-@frozen
+@frozen(cache_hash=True)  # it is a key of caches
 class Scenario:
     """Complete configuration, read by all roles."""
 

@@ -74,12 +74,13 @@ class SenseRate:
         """Let the vehicle get a SENSE in every tick again."""
         self._held = None
 
-    def is_due(self, situation: Situation, tick: int) -> bool:
-        """Return whether the vehicle gets a SENSE in a tick; if so, also in the following ones."""
-        held = self._held
-        if held is not None and (tick >= self._until_tick or not situation.is_like(held)):
-            self._held = None
-        return self._held is None
+    def is_over(self, tick: int) -> bool:
+        """Return whether the ticks without SENSE are over."""
+        return tick >= self._until_tick
+
+    def is_disturbed_by(self, situation: Situation) -> bool:
+        """Return whether a situation differs from the one in which the vehicle began to hold."""
+        return self._held is None or not situation.is_like(self._held)
 
 
 def _are_like(now: tuple[Neighbour, ...], before: tuple[Neighbour, ...]) -> bool:

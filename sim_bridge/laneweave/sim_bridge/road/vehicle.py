@@ -272,16 +272,15 @@ class RoadVehicle:
     def needs_sense(self, tick: int) -> bool:
         """Return whether the vehicle gets a SENSE in a tick; see `sense_rate`."""
         rate, controller = self.sense_rate, self.controller
-        if rate.full:
-            return True
-        if (
-            controller.off_lattice is not None
+        if not rate.full and (
+            rate.is_over(tick)
+            or controller.off_lattice is not None
             or controller.level > FallbackLevel.HOLD
             or not controller.has_settled(tick * controller.tick_s)
+            or rate.is_disturbed_by(self._situation)
         ):
             rate.disturb()
-            return True
-        return rate.is_due(self._situation, tick)
+        return rate.full
 
     def enter_lattice(self, cells: Sequence[Cell]) -> None:
         """Enter the lattice again: the roadside assigns cells, among them the hold cell."""
