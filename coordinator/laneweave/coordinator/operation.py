@@ -30,7 +30,8 @@ class ToVehicle:
 
 
 Outcome = Effect | LogEntry | ToVehicle
-"""What an operation yields: effects, and what the coordinator's core makes into effects."""
+"""What an operation yields; the coordinator's core turns log entries and messages to vehicles into
+effects."""
 
 
 class Operation(Protocol):
