@@ -33,14 +33,14 @@ class Memory(threading.Thread):
     """Samples the memory of this process and its children that no other process shares."""
 
     def __init__(self) -> None:
-        """Begin at once."""
+        """Start sampling."""
         super().__init__(daemon=True)
         self.peak_bytes = 0
         self._ended = threading.Event()
         self.start()
 
     def run(self) -> None:
-        """Sample until `end`."""
+        """Take samples until `end` is called."""
         own = psutil.Process()
         while not self._ended.wait(SAMPLE_S):
             total = 0
@@ -52,7 +52,7 @@ class Memory(threading.Thread):
             self.peak_bytes = max(self.peak_bytes, total)
 
     def end(self) -> float:
-        """Stop; return the highest total [GiB]."""
+        """Stop sampling; return the highest total [GiB]."""
         self._ended.set()
         self.join()
         return self.peak_bytes / 2**30
@@ -92,7 +92,7 @@ def factors(ticks: Path) -> list[tuple[int, float]]:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run and print."""
+    """Run the road and print the figures."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--vehicles-per-process", type=int, default=250, metavar="N")
     parser.add_argument("--operation", default="formations")

@@ -168,7 +168,7 @@ class Forger:
         self._transports[0].publish(key, payload, Quality.ASSURED)
 
     def to_victim(self, topic: Topic, message: object) -> None:
-        """Publish a message to the victim or, if it is addressed to none, in its name."""
+        """Publish a message to the victim; on other topics, a message in the victim's name."""
         if not topic.addressed:
             self.publish(topic, message, vehicle=self.victim)
             return

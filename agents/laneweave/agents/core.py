@@ -28,14 +28,7 @@ from laneweave.agents.undisturbed import HoldWatch
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell, PlannedMove, stretch_of
 from laneweave.protocol.road_layout import NO_PARTS, TemporaryParts
-from laneweave.protocol.runtime.node import (
-    Arrived,
-    Effect,
-    Event,
-    Refuse,
-    Send,
-    Stopping,
-)
+from laneweave.protocol.runtime.node import Arrived, Effect, Event, Refuse, Send, Stopping
 from laneweave.protocol.scenario.deployment_fields import MAX_HOLD_S
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.vehicle_tables import Vehicle
@@ -61,12 +54,7 @@ from laneweave.protocol.wire.messages import (
 )
 from laneweave.protocol.wire.newest import FORGET_S, NewestRoad
 from laneweave.protocol.wire.process_messages import Report
-from laneweave.protocol.wire.topics import (
-    COMMAND,
-    MOTION,
-    REPORT,
-    STATE,
-)
+from laneweave.protocol.wire.topics import COMMAND, MOTION, REPORT, STATE
 
 MAX_REPEATS = 50
 """Maximum number of ticks in which a process repeats a move that the motion controller does not
@@ -182,11 +170,7 @@ class AgentCore:
                 return []
             self._want_states()
             return effects
-        match event:
-            case Stopping():
-                return [self._final_report()]
-            case _:
-                return []
+        return [self._final_report()] if isinstance(event, Stopping) else []
 
     def _want_states(self) -> None:
         execution, sense = self.execution, self._sense

@@ -172,7 +172,7 @@ class SimulatedRoad(Generic[VehicleT]):
                 yield from self.sense_of(vehicle)
 
     def sense_of(self, vehicle: RoadVehicle) -> list[Effect]:
-        """Return the SENSE of a vehicle in the current tick, for each process with an agent."""
+        """Return the effects that send a vehicle's SENSE of the current tick to its processes."""
         return vehicle.send_sense(self.tick, caretaker=vehicle.name in self.caretakers)
 
     # --- the tick -----------------------------------------------------------------------------

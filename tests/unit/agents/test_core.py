@@ -44,6 +44,13 @@ def test_the_state_contains_measurements_and_the_block_of_entry() -> None:
     assert rig.shown == [holding(ME, None, HOME, block=5, joined=(5, 6), **values)]
 
 
+def test_a_new_agent_waits_for_its_first_sense() -> None:
+    agent = AgentCore(ME, lambda: 1, SCENARIO)
+    assert list(agent.handle(node.Started(), 0.0)) == []
+    assert agent.wakeup_s is None
+    assert agent.wanted_states == ()
+
+
 def test_an_agent_whose_vehicle_has_left_reports_once() -> None:
     rig = up_and_running()
     effects = rig.hand(topics.SENSE, rig.sense(left=True))
@@ -51,6 +58,8 @@ def test_an_agent_whose_vehicle_has_left_reports_once() -> None:
     (report,) = sent(effects, Report)
     assert (report.role, report.name, report.solves, report.unusable) == ("agent", ME, 2, 0)
     assert len(report.solve_ms) == 2 * 4
+    assert isinstance(effects[0], node.Send)
+    assert effects[0].topic is topics.REPORT
     assert len(effects) == 1
     assert rig.hand(topics.SENSE, rig.sense(left=True)) == []
 

@@ -36,7 +36,7 @@ def next_tick(desk: Desk) -> list[Effect]:
     return desk.effects
 
 
-def told(desk: Desk) -> dict[Name, tuple[Name, ...]]:
+def in_census(desk: Desk) -> dict[Name, tuple[Name, ...]]:
     """Return the processes of the vehicles in the newest census."""
     return {each.vehicle: each.processes for each in sent(desk.effects, Census)[-1].on_road}
 
@@ -46,7 +46,7 @@ def test_without_a_token_the_process_has_the_name_of_the_vehicle(desk: Desk) -> 
     desk.up(A)
     assert addressees(next_tick(desk), A) == [A]
     desk.drive_to(desk.core.tick + 10)
-    assert told(desk) == {A: (), B: ()}
+    assert in_census(desk) == {A: (), B: ()}
 
 
 def test_a_token_before_the_entry_says_where_the_agent_is(tmp_path: Path) -> None:
@@ -55,7 +55,7 @@ def test_a_token_before_the_entry_says_where_the_agent_is(tmp_path: Path) -> Non
     desk.up(A, F)
     desk.drive_to_entry(A, B)
     assert set(addressees(desk.effects, A)) == {F}
-    assert told(desk) == {A: (F,), B: ()}
+    assert in_census(desk) == {A: (F,), B: ()}
 
 
 def test_a_new_token_takes_effect_with_the_next_tick_and_its_census(desk: Desk) -> None:
@@ -63,7 +63,7 @@ def test_a_new_token_takes_effect_with_the_next_tick_and_its_census(desk: Desk) 
     effects = next_tick(desk)
     assert addressees(effects, A) == [F]
     assert addressees(effects, B) == [B]
-    assert told(desk) == {A: (F,), B: ()}
+    assert in_census(desk) == {A: (F,), B: ()}
 
 
 def test_two_processes_with_an_agent_get_the_same(desk: Desk) -> None:
@@ -72,7 +72,7 @@ def test_two_processes_with_an_agent_get_the_same(desk: Desk) -> None:
     effects = next_tick(desk)
     assert addressees(effects, A) == [F, G]
     assert len({id(sense) for sense in sent(effects, Sense) if sense.vehicle == A}) == 1
-    assert told(desk)[A] == (F, G)
+    assert in_census(desk)[A] == (F, G)
 
 
 def test_a_vehicle_with_one_of_two_tokens_left_is_attended(desk: Desk) -> None:
@@ -85,7 +85,7 @@ def test_a_vehicle_with_one_of_two_tokens_left_is_attended(desk: Desk) -> None:
 
 
 def test_the_last_process_is_still_addressed_after_its_token_has_vanished(desk: Desk) -> None:
-    """Its agent may claim the vehicle again, as one may that has been told that it has left."""
+    """The agent may claim the vehicle again, for example after a wrong message that it has left."""
     desk.up(A, F)
     desk.down(A, F)
     assert addressees(next_tick(desk), A) == [F]
@@ -99,7 +99,7 @@ def test_the_last_process_is_still_addressed_after_its_token_has_vanished(desk: 
 def test_after_a_lost_link_only_tokens_that_appear_again_count(
     desk: Desk, order: str, *, stays: bool
 ) -> None:
-    """In whichever order the events arrive: link and tokens have threads of their own."""
+    """Events of link and tokens come from different threads, and so in any order."""
     desk.up(A, F)
     desk.up(A, G)
     next_tick(desk)

@@ -42,7 +42,7 @@ QUEUE_M = 10.0
 MAX_OVERTAKING_S = 25.0
 """Maximum time for which a formation leaves a lane to others; slower ones drive behind it."""
 MAX_GOALS = 256
-"""Maximum number of lanes and destinations for which a stage remembers the goal lanes."""
+"""Maximum number of pairs of a lane and a destination whose goal lanes a stage keeps."""
 LEFT_M = 1.0
 """Length of a lane that is left behind the last part that a formation leaves to others, and minimum
 length of such a part."""

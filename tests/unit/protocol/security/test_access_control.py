@@ -148,7 +148,7 @@ def test_every_topic_has_senders_and_readers() -> None:
     parties = set(Party)
     for topic in TOPICS:
         assert topic.sender in {*parties, "any"}, topic.name
-        assert {*topic.readers, *filter(None, (topic.deputy,))} <= parties
+        assert {*topic.readers, topic.deputy} <= {*parties, None}
         assert topic.readers or topic.addressed, topic.name
         # Whom a key names is among its parameters.
         assert not topic.addressed or topic.parameters == ("process", "vehicle")
