@@ -15,6 +15,8 @@ separate process. Requests are formations of 6 to 18 vehicles. The measurements:
   the service is the latency minus the solver's time and minus the time that the request waited for
   a busy worker: even at half load, any single server has a queue. Measured with the same
   formations, and with small ones at hundreds of requests per second.
+- *turns*: one client, then four, each with one small request in flight, of the paper's kinds of
+  conflict. The figures are the rate and the overhead.
 - *loss*: three coordinators with one worker each, of which one after another is killed. The figures
   count the requests that were in flight when one was killed, or were sent within the next second.
 - *cancel*: a client asks for a plan that takes 5 s, and cancels its task, exceeds its timeout, or
@@ -57,7 +59,7 @@ from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
 from laneweave.coordinator.planning.response import PlanResponse
 from laneweave.coordinator.planning.solve import plan
 from laneweave.coordinator.service.client import AsyncPlanClient, PlanClient, PlanError
-from laneweave.launch.bench.request_families import formation_request
+from laneweave.launch.bench.request_families import block_request, formation_request
 from laneweave.protocol.runtime.queries import JSON
 from laneweave.protocol.scenario.formation_table import DEFAULT_CONFLICTS
 from laneweave.protocol.security.connection import Access
@@ -71,6 +73,7 @@ SIZES = range(6, 19)
 DEADLINE_S = 300.0
 """Longer than the whole measurement: no request is dropped, and plans do not depend on the load."""
 SMALL = range(6, 11)
+TURNS, TURNS_START_S = 1000, 10.0
 LOSSES = 10
 LOSS_PAUSE_S = 3.0
 LOSS_RATE_PER_S = 60.0
@@ -275,6 +278,42 @@ def half(workers: int, sizes: Sequence[int], count: int) -> dict[str, Any]:
         "waited_ms": quantiles([one.response.waited_ms or 0.0 for one in exchanges]),
         "solve_ms": quantiles([one.response.solve_ms for one in exchanges]),
     }
+
+
+def turns(clients: int) -> dict[str, Any]:
+    """Measure clients that send one request after the other, each in its own process."""
+    context = multiprocessing.get_context("spawn")
+    count = TURNS // clients
+    with network(coordinators=1, workers=2) as net, context.Pool(clients) as pool:
+        start_s = time.monotonic() + TURNS_START_S
+        shares = [(net.endpoint, start_s, number * count, count) for number in range(clients)]
+        exchanges = [one for share in pool.starmap(_ask_in_turn, shares, 1) for one in share]
+    end_s = max(one.sent_s + one.latency_s for one in exchanges)
+    beyond = [1e3 * one.latency_s - one.response.solve_ms for one in exchanges]
+    return {
+        "clients": clients,
+        "requests": len(exchanges),
+        "rate_per_s": len(exchanges) / (end_s - start_s),
+        "beyond_solving_ms": quantiles(beyond),
+        "added_ms": quantiles([one.added_ms for one in exchanges]),
+        "solve_ms": quantiles([one.response.solve_ms for one in exchanges]),
+    }
+
+
+def _ask_in_turn(endpoint: str, start_s: float, first: int, count: int) -> list[Exchange]:
+    requests = [
+        block_request(seed, vehicles=6, columns=4, conflicts=("node", "edge"))
+        for seed in range(first, first + count)
+    ]
+    exchanges = []
+    with PlanClient(endpoint) as client:
+        client.plan(requests[0])
+        time.sleep(max(0.0, start_s - time.monotonic()))
+        for request in requests:
+            begun_s = time.monotonic()
+            response = client.plan(request)
+            exchanges.append(Exchange(begun_s, time.monotonic() - begun_s, response))
+    return exchanges
 
 
 def loss() -> dict[str, Any]:
@@ -517,7 +556,7 @@ def quantiles(values: list[float]) -> dict[str, float | None]:
     return percentiles_of(np.array(values), 50, 95, 99, largest=True)
 
 
-MEASUREMENTS = ("load", "half", "loss", "cancel", "flood", "road")
+MEASUREMENTS = ("load", "half", "turns", "loss", "cancel", "flood", "road")
 
 
 def main() -> None:
@@ -537,6 +576,8 @@ def main() -> None:
     if options.only in (None, "half"):
         BRANCHING.load()
         found["half"] = [half(1, SIZES, 300), half(2, SIZES, 300), half(1, SMALL, 1000)]
+    if options.only in (None, "turns"):
+        found["turns"] = [turns(clients) for clients in (1, 4)]
     if options.only in (None, "loss"):
         BRANCHING.load()
         found["loss"] = loss()

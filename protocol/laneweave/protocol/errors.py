@@ -222,8 +222,9 @@ def _comparable(name: str) -> str:
 
 def one_line(text: str, length: int = 500) -> str:
     """Return a text as one printable line of at most `length` characters."""
-    words = "".join(char if char.isprintable() else " " for char in text).split()
-    line = " ".join(words)
+    if not text.isprintable():
+        text = "".join(char if char.isprintable() else " " for char in text)
+    line = " ".join(text.split())
     return line if len(line) <= length else line[: length - 3] + "..."
 
 

@@ -43,6 +43,8 @@ NumberOrRange = float | tuple[float, float]
 """A number, or the range from which it is drawn."""
 TextOrTexts = str | tuple[str, ...]
 """One text or several."""
+IsGiven = Callable[[str, Any], bool]
+_PLAIN = frozenset({int, str, float, bool, type(None)})
 KEY = "key"
 """Key of a field's metadata: name of the field in files, where it differs. Python reserves `from`.
 Files may also use the name of the field in Python."""
@@ -281,11 +283,26 @@ def path_keys(field: str) -> tuple[str, ...]:
     return tuple(re.findall(r"[^.\[\]]+", field))
 
 
-def as_lists(_: object, __: object, value: object) -> object:
-    """Return tuples and frozensets (sorted) as lists, for `attrs.asdict`."""
-    if isinstance(value, frozenset):
-        value = tuple(sorted(value))
-    return [as_lists(_, __, item) for item in value] if isinstance(value, tuple) else value
+def json_form(value: Any, is_given: IsGiven = lambda _, __: True) -> Any:  # noqa: ANN401
+    """Return an attrs instance as a map, and tuples and frozensets (sorted) as lists.
+
+    Takes a quarter of the time of `attrs.asdict`.
+
+    Args:
+        value: the instance, or a part of it; plain values stay as they are.
+        is_given: whether the map contains a field, from its name and value.
+    """
+    kind = type(value)
+    if kind in _PLAIN:
+        return value
+    if kind is tuple or kind is frozenset:
+        items = sorted(value) if kind is frozenset else value
+        return [item if type(item) in _PLAIN else json_form(item, is_given) for item in items]
+    return {
+        name: json_form(inner, is_given)
+        for name in (attribute.name for attribute in attrs.fields(kind))
+        if is_given(name, inner := getattr(value, name))
+    }
 
 
 def _invalid_values(

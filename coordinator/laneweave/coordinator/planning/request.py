@@ -38,7 +38,7 @@ from laneweave.protocol.errors import (
 from laneweave.protocol.lattice import Cell, Mode, displacements
 from laneweave.protocol.names import NAME_PATTERN, NAME_RULE
 from laneweave.protocol.scenario.formation_table import CONFLICT_KINDS, DEFAULT_CONFLICTS
-from laneweave.protocol.structuring import as_lists, structure, without
+from laneweave.protocol.structuring import json_form, structure, without
 
 REQUEST_SCHEMA: Final = "laneweave.plan.request/1"
 DEFAULT_DEADLINE_S: Final = 4.0
@@ -53,6 +53,7 @@ MAX_STEPS: Final = 10_000
 """Maximum number of steps of a plan, where it is limited."""
 
 _KNOWN_KEYS: Final = "only known keys"
+_SCALARS: Final = (int, str, float, bool)
 _NOT_BOTH: Final = "structure or targets, not both"
 
 
@@ -186,8 +187,7 @@ class PlanRequest:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the JSON form."""
-        fields = attrs.asdict(self, filter=_is_given, value_serializer=as_lists)
-        return {"schema": REQUEST_SCHEMA, **fields}
+        return {"schema": REQUEST_SCHEMA, **json_form(self, _is_given)}
 
 
 @attrs.frozen
@@ -244,9 +244,9 @@ def _document(data: Mapping[str, Any]) -> tuple[_Document | None, Sequence[BadIn
         return None, problems
 
 
-def _is_given(attribute: attrs.Attribute[Any], value: object) -> bool:
+def _is_given(name: str, value: object) -> bool:
     """Return whether the JSON form contains a field."""
-    return value is not None and value != "" and (attribute.name != "targets" or value != ())
+    return value is not None and value != "" and (name != "targets" or value != ())
 
 
 def _json_problems(parent: str, value: object) -> Iterator[BadInputError]:
@@ -259,13 +259,13 @@ def _json_problems(parent: str, value: object) -> Iterator[BadInputError]:
                 yield BadInputError(prefix + shown, item, _KNOWN_KEYS)
             elif item is None:
                 yield BadInputError(prefix + key, None, "a value, or no such key")
-            elif key != "geometry":
+            elif key != "geometry" and type(item) not in _SCALARS:
                 yield from _json_problems(prefix + key, item)
     elif isinstance(value, list | tuple):
         for i, item in enumerate(value):
             if item is None:
                 yield BadInputError(f"{parent}[{i}]", None, "a value, or no such key")
-            else:
+            elif type(item) not in _SCALARS:
                 yield from _json_problems(f"{parent}[{i}]", item)
 
 

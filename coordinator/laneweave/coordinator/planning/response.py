@@ -12,7 +12,7 @@ from laneweave.coordinator.planning.path_map import RelativePathMap
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.field_validators import within
 from laneweave.protocol.lattice import Cell
-from laneweave.protocol.structuring import as_lists, structure
+from laneweave.protocol.structuring import json_form, structure
 
 RESPONSE_SCHEMA: Final = "laneweave.plan.response/1"
 
@@ -61,8 +61,7 @@ class PlanResponse:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the JSON form."""
-        fields = attrs.asdict(self, filter=_is_given, value_serializer=as_lists)
-        return {"schema": RESPONSE_SCHEMA, **fields}
+        return {"schema": RESPONSE_SCHEMA, **json_form(self, _is_given)}
 
     @classmethod
     def from_dict(cls, data: object) -> PlanResponse:
@@ -84,8 +83,8 @@ PlanFunction = Callable[..., PlanResponse]
 """Function that answers a `PlanRequest`; takes the keyword arguments of `solve.plan`."""
 
 
-def _is_given(attribute: attrs.Attribute[Any], value: object) -> bool:
+def _is_given(name: str, value: object) -> bool:
     """Return whether the JSON form contains a field."""
-    if attribute.name == "fallback":
+    if name == "fallback":
         return bool(value)
-    return value is not None or attribute.name not in _OPTIONAL
+    return value is not None or name not in _OPTIONAL

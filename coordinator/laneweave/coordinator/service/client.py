@@ -31,7 +31,6 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-import attrs
 from attrs import define
 
 from laneweave.coordinator.planning.request import PlanRequest
@@ -108,17 +107,13 @@ class PendingRequest:
     if its coordinator is overloaded.
     """
 
-    request: PlanRequest
+    payload: bytes
+    """Encoded request; equal bytes are assigned to the same coordinator."""
     timeout_s: float
     begun_s: float
     network: str
     """Endpoint and realm, for errors."""
     _pause_s: float = FIRST_PAUSE_S
-
-    @property
-    def payload(self) -> bytes:
-        """Encoded request; equal bytes are assigned to the same coordinator."""
-        return JSON.write(self.request.to_dict())
 
     def left_s(self, now_s: float) -> float:
         """Return the remaining time [s]."""
@@ -247,18 +242,18 @@ class _Connection:
     @contextlib.contextmanager
     def _pending(self, request: PlanRequest, timeout_s: float) -> Iterator[PendingRequest]:
         """Provide a request to send; cancel it if the block ends without an answer."""
-        if not request.id:
-            request = attrs.evolve(request, id=uuid.uuid4().hex)
-        pending = PendingRequest(request, timeout_s, time.monotonic(), self._network)
+        request_id = request.id or uuid.uuid4().hex
+        payload = JSON.write(request.to_dict() | {"id": request_id})
+        pending = PendingRequest(payload, timeout_s, time.monotonic(), self._network)
         try:
             yield pending
         except PlanError:
             raise
         except TimeoutError:
-            self.cancel(request.id)
+            self.cancel(request_id)
             raise pending.unanswered from None
         except BaseException:
-            self.cancel(request.id)
+            self.cancel(request_id)
             raise
 
     def _ask(self, pending: PendingRequest) -> Future[Answer | None]:

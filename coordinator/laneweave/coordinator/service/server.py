@@ -14,7 +14,7 @@ from functools import partial
 from typing import ClassVar
 
 import attrs
-from attrs import frozen
+from attrs import define
 
 from laneweave.coordinator.planning.plug_ins.registry import check_solver
 from laneweave.coordinator.planning.request import PlanRequest
@@ -59,7 +59,7 @@ MEAN_WEIGHT = 0.1
 """Weight of the newest plan in the mean time of plans."""
 
 
-@frozen
+@define
 class ServiceMetrics:
     """Counters of the service, and its current load."""
 
@@ -397,8 +397,7 @@ class PlanningService:
         self._forget(entry)
 
     def _count(self, name: str, by: float = 1) -> None:
-        counted = getattr(self._metrics, name) + by
-        self._metrics = attrs.evolve(self._metrics, **{name: counted})
+        setattr(self._metrics, name, getattr(self._metrics, name) + by)
 
 
 def plan_in_time(

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from typing import Any, Final
 
-import attrs
 from attrs import field, frozen
 from attrs.validators import optional
 
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.field_validators import one_of, within
 from laneweave.protocol.road_layout import LONGEST_ROAD_M
-from laneweave.protocol.structuring import as_lists, structure
+from laneweave.protocol.structuring import json_form, structure
 
 REQUEST_SCHEMA: Final = "laneweave.road.request/1"
 RESPONSE_SCHEMA: Final = "laneweave.road.response/1"
@@ -39,7 +38,7 @@ class RoadRequest:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the request as a map."""
-        return {"schema": REQUEST_SCHEMA, **attrs.asdict(self)}
+        return {"schema": REQUEST_SCHEMA, **json_form(self)}
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> RoadRequest:
@@ -77,7 +76,7 @@ class RoadResponse:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the response as a map."""
-        return {"schema": RESPONSE_SCHEMA, **attrs.asdict(self, value_serializer=as_lists)}
+        return {"schema": RESPONSE_SCHEMA, **json_form(self)}
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> RoadResponse:

@@ -55,7 +55,8 @@ FORMATS = pytest.mark.parametrize("form", [JSON, MSGPACK], ids=["JSON", "Message
 
 
 def inquiry(timeout_s: float = 10.0) -> PendingRequest:
-    return PendingRequest(REQUEST, timeout_s, START_S, "tcp/router:7447, realm default,")
+    payload = JSON.write(REQUEST.to_dict())
+    return PendingRequest(payload, timeout_s, START_S, "tcp/router:7447, realm default,")
 
 
 def refusal(**data: object) -> Answer:

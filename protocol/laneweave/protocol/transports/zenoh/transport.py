@@ -229,7 +229,8 @@ class ZenohTransport:
         try:
             self._session.get(
                 key,
-                zenoh.handlers.Callback(take, lambda: _settle(first, None)),
+                # The binding starts a thread for each indirect callback, which takes 0.1 ms.
+                zenoh.handlers.Callback(take, lambda: _settle(first, None), indirect=False),
                 payload=payload,
                 encoding=encoding or None,
                 attachment=sender or None,
