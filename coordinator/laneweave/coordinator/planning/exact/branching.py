@@ -67,9 +67,9 @@ _NODES_BETWEEN = 8
 """Nodes between attempts to find path sets by heuristics."""
 _MANY_VEHICLES = 20
 """Formation size from which a path set is sought first, since the search takes long."""
-_FIRST_WORK, _WORK_FOR_GAP, _STALE = 200, 100, 100
+_FIRST_WORK, _WORK_FOR_GAP = 200, 300
 """Maximum number of negotiation passes per call until a path set is found; afterwards, their number
-at a gap of 100 %, and the passes without improvement after which that number is halved."""
+at a gap of 100 %."""
 _EXPLORE_NODES, _EXPLORE_MOVES, _MAX_EXPLORE_MOVES, _GROWTH = 16, 5_000, 1_500_000, 4
 """Nodes after which reachable states are explored if no path set is known, and the initial and
 maximum limit on joint moves; nodes and limit grow by the factor `_GROWTH`."""
@@ -338,8 +338,7 @@ class Branching(Search):
             self.negotiate(root, _FIRST_WORK, stop_at_first=True)
         else:
             self._negotiation.suggest(multipliers.copy(), root.held_targets())
-            hope = 1.0 / (1.0 + self._negotiation.stale / _STALE)
-            self.negotiate(root, 1 + int(_WORK_FOR_GAP * self._gap() * hope))
+            self.negotiate(root, 1 if self._few else 1 + int(_WORK_FOR_GAP * self._gap()))
         if self.best is None and self._nodes >= self._explore_nodes:
             self._explore()
 

@@ -249,9 +249,7 @@ def _relax_moves(
             cost += multipliers[r]
         move_cost[m] = cost
         for p in range(first_pair, end_pair):
-            total = cost + next_costs[next_cell, p]
-            if total < costs[cell, p]:
-                costs[cell, p] = total
+            costs[cell, p] = min(costs[cell, p], cost + next_costs[next_cell, p])
 
 
 @njit(cache=True)

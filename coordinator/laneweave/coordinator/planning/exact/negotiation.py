@@ -83,7 +83,6 @@ class Negotiation:
 
     cost: cost of the best path set; None: there is none yet.
     path: (N, T) displacements of the best path set.
-    stale: number of calls to `work` since the best path set was found.
     """
 
     def __init__(self, arrays: MoveArrays, teams: Teams, multipliers: Floats, target: Ints) -> None:
@@ -97,7 +96,6 @@ class Negotiation:
         """
         self.cost: int | None = None
         self.path: Ints = np.empty((0, 0), dtype=np.int64)
-        self.stale = 0
         self._arrays = arrays
         self._teams = teams
         self._multipliers = multipliers
@@ -131,7 +129,6 @@ class Negotiation:
         `check_time` may raise an error to stop the work.
         """
         check_time()
-        self.stale += 1
         if self._conflict_free:
             return self._improve()
         self._conflict_free = negotiate(self._arrays, self._teams, self._candidate, self._passes)
@@ -161,7 +158,7 @@ class Negotiation:
         cost = int(self._candidate.cost.sum())
         if self.cost is not None and cost >= self.cost:
             return False
-        self.cost, self.path, self.stale = cost, self._candidate.path.copy(), 0
+        self.cost, self.path = cost, self._candidate.path.copy()
         return True
 
     def _drop_idle_steps(self) -> None:

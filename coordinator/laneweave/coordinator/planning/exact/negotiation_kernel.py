@@ -25,26 +25,32 @@ _SWAP_SHARE = 60
 
 
 @njit(cache=True)
-def _find_path(arrays, teams, candidate, i):
-    """Set one vehicle's cheapest path at the current clique costs, and the cost of the path."""
+def _find_path(arrays, teams, candidate, i, steps):
+    """Set one vehicle's cheapest path at the current clique costs, and the cost of the path.
+
+    steps: maximum number of steps until its arrival.
+    """
     valid, step, clique = teams.drives[teams.team[i]], arrays.step, arrays.clique
     weight, cost_to_go, parked = candidate.weight, candidate.cost_to_go, candidate.parked
     pair = teams.pair[teams.team[i], candidate.target[i]]
     start, target, distance = teams.start[i], teams.pair_cell[pair], teams.distance[:, pair]
     path = candidate.path[i]
-    steps = len(weight)
     displacements, cells = valid.shape
     max_cliques = clique.shape[2]
+    parked[len(weight)] = 0.0
+    for t in range(len(weight) - 1, -1, -1):
+        parked[t] = parked[t + 1] + penalty_of(clique, weight, t, 0, target)
     for cell in range(cells):
         cost_to_go[steps, cell] = NOT_IN_TIME + _DETOUR * distance[cell]
-    cost_to_go[steps, target] = 0.0
-    parked[steps] = 0.0
+    cost_to_go[steps, target] = parked[steps]
     lanes = arrays.lanes
     column = start // lanes
     for t in range(steps - 1, -1, -1):
-        parked[t] = parked[t + 1] + penalty_of(clique, weight, t, 0, target)
         # A vehicle moves at most one column per step.
         for cell in range(max(0, column - t) * lanes, min(cells, (column + t + 1) * lanes)):
+            if distance[cell] > steps - t:
+                cost_to_go[t, cell] = NOT_IN_TIME + _DETOUR * distance[cell]
+                continue
             best = np.inf
             for d in range(displacements):
                 if valid[d, cell]:
@@ -83,7 +89,7 @@ def _find_path(arrays, teams, candidate, i):
 
 @njit(cache=True)
 def add_uses(arrays, start, path, use, times):
-    """Add `times` uses to each clique on a path; -1 removes one."""
+    """Add `times` to the uses, or weights, of each clique on a path; -1 removes a use."""
     clique, step = arrays.clique, arrays.step
     cell = start
     for t in range(len(path)):
@@ -131,17 +137,19 @@ def negotiate(arrays, teams, candidate, number):
     cost = min(_FIRST_COST * _GROWTH**number, _MAX_COST)
     order = np.arange(len(teams.start))
     _shuffle(order, candidate.random)
+    for t in range(steps):
+        for clique in range(cliques):
+            weight[t, clique] = history[t, clique] + cost * use[t, clique]
     for i in order:
         if number > 0:
             late = candidate.cost[i] >= NOT_IN_TIME
             if not late and not _is_contested(arrays, teams.start[i], candidate.path[i], use):
                 continue
             add_uses(arrays, teams.start[i], candidate.path[i], use, -1.0)
-        for t in range(steps):
-            for clique in range(cliques):
-                weight[t, clique] = history[t, clique] + cost * use[t, clique]
-        _find_path(arrays, teams, candidate, i)
+            add_uses(arrays, teams.start[i], candidate.path[i], weight, -cost)
+        _find_path(arrays, teams, candidate, i, steps)
         add_uses(arrays, teams.start[i], candidate.path[i], use, 1.0)
+        add_uses(arrays, teams.start[i], candidate.path[i], weight, cost)
     conflict_free = candidate.cost.max() < NOT_IN_TIME
     for t in range(steps):
         for clique in range(cliques):
@@ -188,7 +196,9 @@ def improve_paths(arrays, teams, candidate, attempts, max_size):
         shortest = 0.0
         for i in chosen:
             shortest += teams.distance[start[i], pair[team[i], target[i]]]
-        solved = shortest <= before and _negotiate_among(arrays, teams, candidate, chosen, before)
+        solved = shortest <= before and _negotiate_among(
+            arrays, teams, candidate, chosen, before, before - shortest
+        )
         after = 0
         for i in chosen:
             if not solved:
@@ -201,13 +211,18 @@ def improve_paths(arrays, teams, candidate, attempts, max_size):
 
 
 @njit(cache=True)
-def _negotiate_among(arrays, teams, candidate, chosen, max_cost):
-    """Negotiate paths for removed vehicles around fixed others; return whether it succeeded."""
-    use, own, history, weight = candidate.use, candidate.own, candidate.history, candidate.weight
-    path, start, cost = candidate.path, teams.start, candidate.cost
+def _negotiate_among(arrays, teams, candidate, chosen, max_cost, max_delay):
+    """Negotiate paths for removed vehicles around fixed others; return whether it succeeded.
+
+    max_cost: maximum sum of their costs. max_delay: by how much it exceeds that of shortest paths.
+    """
+    use, own, weight = candidate.use, candidate.own, candidate.weight
+    path, start, cost, pair = candidate.path, teams.start, candidate.cost, teams.pair
     steps, cliques = use.shape
     own[:] = 0.0
-    history[:] = 0.0
+    for t in range(steps):
+        for clique in range(cliques):
+            weight[t, clique] = NOT_IN_TIME * use[t, clique]
     order = chosen.copy()
     cost_of_use = 1.0
     for number in range(_ROUNDS):
@@ -217,25 +232,27 @@ def _negotiate_among(arrays, teams, candidate, chosen, max_cost):
                 if not _is_contested(arrays, start[i], path[i], own):
                     continue
                 add_uses(arrays, start[i], path[i], own, -1.0)
-            for t in range(steps):
-                for clique in range(cliques):
-                    taken = NOT_IN_TIME * use[t, clique]
-                    weight[t, clique] = taken + history[t, clique] + cost_of_use * own[t, clique]
-            _find_path(arrays, teams, candidate, i)
+                add_uses(arrays, start[i], path[i], weight, -cost_of_use)
+            shortest = teams.distance[start[i], pair[teams.team[i], candidate.target[i]]]
+            most = min(steps, int(shortest + max_delay))
+            _find_path(arrays, teams, candidate, i, most)
             if candidate.cost_to_go[0, start[i]] >= NOT_IN_TIME:
                 return False
             add_uses(arrays, start[i], path[i], own, 1.0)
+            add_uses(arrays, start[i], path[i], weight, cost_of_use)
         total = 0
         for i in chosen:
             total += cost[i]
         if total > max_cost:
             return False
         solved = True
+        more = (_ROUND_GROWTH - 1.0) * cost_of_use
         for t in range(steps):
             for clique in range(cliques):
+                weight[t, clique] += more * own[t, clique]
                 if own[t, clique] > 1.5:
                     solved = False
-                    history[t, clique] += _ROUND_HISTORY
+                    weight[t, clique] += _ROUND_HISTORY
         if solved:
             return True
         cost_of_use *= _ROUND_GROWTH
