@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
+from itertools import accumulate
 from typing import NamedTuple
 
 import numpy as np
@@ -133,28 +134,28 @@ def teams(
     numbers: dict[tuple[frozenset[int], frozenset[int]], int] = {}
     members = zip(choices, excluded, strict=True)
     team = [numbers.setdefault(member, len(numbers)) for member in members]
-    pair_target = [j for choice, _ in numbers for j in sorted(choice)]
-    pairs_from = np.cumsum([0, *(len(choice) for choice, _ in numbers)])
+    pairs = [(k, j) for k, (choice, _) in enumerate(numbers) for j in sorted(choice)]
+    sizes = [len(choice) for choice, _ in numbers]
+    pairs_from = np.array([*accumulate(sizes, initial=0)], dtype=np.int64)
+    pair_team, pair_target = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
     pair = np.full((len(numbers), len(targets)), -1, dtype=np.int64)
+    pair[pair_team, pair_target] = range(len(pairs))
     target = _cells(targets, arrays)
-    numbered = np.array(pair_target, dtype=np.int64)
+    pair_cell = target[pair_target]
     drives = np.repeat(arrays.valid[None], len(numbers), axis=0)
-    distance = np.empty((arrays.valid.shape[1], len(numbered)))
     for k, (_, excluded_of_team) in enumerate(numbers):
-        first, end = pairs_from[k : k + 2]
-        pair[k, pair_target[first:end]] = np.arange(first, end)
-        drives[k, sorted(excluded_of_team)] = False
-        distance[:, first:end] = min_steps(drives[k], arrays.step, target[numbered[first:end]])
+        if excluded_of_team:
+            drives[k, sorted(excluded_of_team)] = False
     return Teams(
         start=_cells(starts, arrays),
         team=np.array(team, dtype=np.int64),
         drives=drives,
         target=target,
-        pairs_from=pairs_from.astype(np.int64),
-        pair_target=numbered,
-        pair_cell=target[numbered],
+        pairs_from=pairs_from,
+        pair_target=np.ascontiguousarray(pair_target),
+        pair_cell=pair_cell,
         pair=pair,
-        distance=distance,
+        distance=min_steps(drives, arrays.step, pairs_from, pair_cell),
     )
 
 

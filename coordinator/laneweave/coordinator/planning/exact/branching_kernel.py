@@ -14,9 +14,9 @@ from laneweave.coordinator.planning.exact.multipliers_kernel import (
     REFUTED,
     STEP_SIZE,
     WEIGHTS,
+    begin,
     fix_by_reduced_cost,
     improve,
-    list_moves,
     start_over,
 )
 
@@ -75,8 +75,7 @@ def _examine(arrays, teams, allowed, earliest, multipliers, scratch, state, uppe
 
     Multipliers are improved and moves fixed by reduced cost as long as that removes many moves.
     """
-    moves, span = list_moves(arrays, allowed, scratch)
-    start_over(multipliers, span, scratch, state)
+    moves, span = begin(arrays, allowed, multipliers, scratch, state)
     for attempt in range(2 * _ROUNDS):
         outcome = improve(
             arrays,
@@ -97,8 +96,7 @@ def _examine(arrays, teams, allowed, earliest, multipliers, scratch, state, uppe
             arrays, teams, allowed, earliest, multipliers, span, scratch, upper_bound
         )
         if kept < _KEPT * moves:
-            moves, span = list_moves(arrays, allowed, scratch)
-            start_over(multipliers, span, scratch, state)
+            moves, span = begin(arrays, allowed, multipliers, scratch, state)
             continue
         if _choose(
             arrays, teams, allowed, earliest, multipliers, span, scratch, state, choice, True

@@ -28,12 +28,11 @@ from laneweave.coordinator.planning.exact.multipliers_kernel import (
     PER_MOVE,
     STEP_SIZE,
     UNREACHABLE,
+    begin,
+    begin_below,
     evaluate,
-    fix_by_reduced_cost,
     improve,
-    list_moves,
     may_need_more_steps,
-    start_over,
 )
 
 _ESTIMATE = -1.0
@@ -165,26 +164,25 @@ class Relaxation:
             self.allowed[:, self._max_steps :] = False
         self.earliest = np.zeros(len(self.teams.pair_cell), dtype=np.int64)
         # Forbid moves from cells that no vehicle can reach in time.
-        self._begin()
-        self._fix(self.allowed, self.earliest, self.multipliers, UNREACHABLE)
+        self._begin_below(self.allowed, self.earliest, self.multipliers, UNREACHABLE)
         self._begin()
 
     def _begin(self) -> None:
         """List the allowed moves and reset the subgradient method."""
-        self._span = list_moves(self.arrays, self.allowed, self.scratch)[1]
-        start_over(self.multipliers, self._span, self.scratch, self.state)
+        _, self._span = begin(self.arrays, self.allowed, self.multipliers, self.scratch, self.state)
 
-    def _fix(
+    def _begin_below(
         self, allowed: Bools, earliest: Ints, multipliers: Floats, upper_bound: float
     ) -> float:
-        bound, _ = fix_by_reduced_cost(
+        """Begin, and forbid what no solution below an upper bound contains; return the bound."""
+        bound, self._span = begin_below(
             self.arrays,
             self.teams,
             allowed,
             earliest,
             multipliers,
-            self._span,
             self.scratch,
+            self.state,
             upper_bound,
         )
         return float(bound)
@@ -243,8 +241,9 @@ class Relaxation:
         """
         nodes.allowed[0], nodes.earliest[0] = self.allowed, self.earliest
         nodes.multipliers[0], nodes.step_size[0] = self.multipliers, 1.0
-        self._begin()
-        bound = self._fix(nodes.allowed[0], nodes.earliest[0], nodes.multipliers[0], upper_bound)
+        bound = self._begin_below(
+            nodes.allowed[0], nodes.earliest[0], nodes.multipliers[0], upper_bound
+        )
         if bound > upper_bound:
             return False
         steps = len(self.multipliers)

@@ -74,33 +74,45 @@ def cliques_of_moves(members, valid):
 
 
 @njit(cache=True, nogil=True)
-def min_steps(valid, step, targets):
-    """Return the minimum steps (X, P) from every cell to each target, ignoring other vehicles."""
-    displacements, cells = valid.shape
-    found = np.full((cells, len(targets)), UNREACHABLE)
+def min_steps(drives, step, pairs_from, pair_cell):
+    """Return the minimum steps (X, P) from every cell to each pair's target, without conflicts.
+
+    Parameters: see `arrays.Teams`.
+    """
+    teams, displacements, cells = drives.shape
+    found = np.full((cells, len(pair_cell)), UNREACHABLE)
     queue = np.empty(cells, np.int64)
-    for p in range(len(targets)):
-        found[targets[p], p] = 0.0
-        queue[0] = targets[p]
-        begin, end = 0, 1
-        while begin < end:
-            next_cell = queue[begin]
-            begin += 1
-            for d in range(displacements):
-                cell = next_cell - step[d]
-                if 0 <= cell < cells and valid[d, cell] and found[cell, p] == UNREACHABLE:
-                    found[cell, p] = found[next_cell, p] + 1.0
-                    queue[end] = cell
-                    end += 1
+    for k in range(teams):
+        valid = drives[k]
+        for p in range(pairs_from[k], pairs_from[k + 1]):
+            found[pair_cell[p], p] = 0.0
+            queue[0] = pair_cell[p]
+            head, end = 0, 1
+            while head < end:
+                next_cell = queue[head]
+                head += 1
+                for d in range(displacements):
+                    cell = next_cell - step[d]
+                    if 0 <= cell < cells and valid[d, cell] and found[cell, p] == UNREACHABLE:
+                        found[cell, p] = found[next_cell, p] + 1.0
+                        queue[end] = cell
+                        end += 1
     return found
 
 
 @njit(cache=True, nogil=True)
-def list_moves(arrays, allowed, scratch):
-    """List the allowed moves of every step.
+def begin(arrays, allowed, multipliers, scratch, state):
+    """List the allowed moves of every step, and reset the subgradient method.
 
     Returns the number of moves, and the number of steps up to the last one with a move.
     """
+    moves, span = _list_moves(arrays, allowed, scratch)
+    start_over(multipliers, span, scratch, state)
+    return moves, span
+
+
+@njit(cache=True)
+def _list_moves(arrays, allowed, scratch):
     teams, steps, displacements, cells = allowed.shape
     move, move_from, step = scratch.move, scratch.move_from, arrays.step
     count, span = 0, 0
@@ -120,7 +132,7 @@ def list_moves(arrays, allowed, scratch):
     return count, span
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def start_over(multipliers, span, scratch, state):
     """Reset the subgradient method; steps without moves have no multipliers."""
     multipliers[span:] = 0.0
@@ -394,6 +406,19 @@ def _excess(multipliers, use, span):
 
 
 @njit(cache=True, nogil=True)
+def begin_below(arrays, teams, allowed, earliest, multipliers, scratch, state, upper_bound):
+    """Begin, and forbid what no solution below the upper bound contains.
+
+    Returns the lower bound and the span; see `begin` and `fix_by_reduced_cost`.
+    """
+    _, span = begin(arrays, allowed, multipliers, scratch, state)
+    bound, _ = fix_by_reduced_cost(
+        arrays, teams, allowed, earliest, multipliers, span, scratch, upper_bound
+    )
+    return bound, span
+
+
+@njit(cache=True)
 def fix_by_reduced_cost(arrays, teams, allowed, earliest, multipliers, span, scratch, upper_bound):
     """Forbid moves and arrivals that no solution below the upper bound contains.
 
