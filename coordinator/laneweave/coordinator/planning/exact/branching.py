@@ -74,8 +74,9 @@ _EXPLORE_NODES, _EXPLORE_MOVES, _MAX_EXPLORE_MOVES, _GROWTH = 16, 5_000, 1_500_0
 """Nodes after which reachable states are explored if no path set is known, and the initial and
 maximum limit on joint moves; nodes and limit grow by the factor `_GROWTH`."""
 _TIE_NODES = 10
-_JOINT_MOVES = 200_000
-"""Moves that the joint search tries every `_NODES_BETWEEN` nodes."""
+_FIRST_JOINT_MOVES, _JOINT_MOVES = 20_000, 200_000
+"""Moves that the joint search tries in its first turn, doubled with each turn, and at most; turns
+come every `_NODES_BETWEEN` nodes."""
 _CALL_WORK = 8
 _BYTES_PER_S = 1_000_000_000
 """Approximate speed at which arrays are filled."""
@@ -112,6 +113,7 @@ class Branching(Search):
         super().__init__()
         self._negotiation: Negotiation | None = None
         self._joint: JointSearch | None = None
+        self._joint_moves = _FIRST_JOINT_MOVES
         self._problem = problem
         self._choices = choices
         self._budget = budget
@@ -365,7 +367,8 @@ class Branching(Search):
             self._joint = JointSearch(self._problem, self._choices, self._budget)
         if self._joint.ended:
             return
-        self._joint.work(_JOINT_MOVES, math.inf if self.best is None else self.best.cost)
+        self._joint.work(self._joint_moves, math.inf if self.best is None else self.best.cost)
+        self._joint_moves = min(2 * self._joint_moves, _JOINT_MOVES)
         self.lower_bound = max(self.lower_bound, self._joint.lower_bound)
         if math.isinf(self.lower_bound):
             self.finished = True
