@@ -18,7 +18,7 @@ from typing import Any
 import attrs
 import numpy as np
 
-from laneweave.coordinator.planning.budget import Budget
+from laneweave.coordinator.planning.budget import Budget, Stopwatch
 from laneweave.coordinator.planning.kernels import BRANCHING
 from laneweave.coordinator.planning.paper.assignments import Weights
 from laneweave.coordinator.planning.paper.cbs import Improvements
@@ -54,13 +54,12 @@ def switch_settings() -> Iterator[tuple[str, Improvements]]:
 
 def planned(request: PlanRequest, improvements: Improvements) -> tuple[float, int | None]:
     """Return CPU time [ms] and cost; the cost is None if it was not proven before the deadline."""
-    began = time.thread_time()
-    budget = Budget(deadline=began + DEADLINE_S, max_nodes=MAX_NODES, clock=time.thread_time)
+    stopwatch = Stopwatch(time.thread_time)
+    budget = Budget(deadline_s=DEADLINE_S, max_nodes=MAX_NODES, stopwatch=stopwatch)
     weights = Weights.for_mode(request.mode)
     run = Tappa(request, request.problem(), weights, budget, improvements)
     run.run()
-    cpu_ms = 1e3 * (time.thread_time() - began)
-    return cpu_ms, run.best.cost if run.finished and run.best is not None else None
+    return 1e3 * stopwatch.time_s, run.best.cost if run.finished and run.best is not None else None
 
 
 def measured(family: str, name: str, improvements: Improvements, instances: int) -> dict[str, Any]:

@@ -21,62 +21,79 @@ class BudgetSpentError(Exception):
     """The deadline has passed or the node limit is reached; results so far stay valid."""
 
 
+class Stopwatch:
+    """The time that a plan takes, without that for loading code."""
+
+    def __init__(self, clock: Clock = time.monotonic) -> None:
+        """Start.
+
+        Args:
+            clock: returns the time for deadlines [s].
+        """
+        self._clock = clock
+        self._began_s, self._began_wall_s = clock(), time.monotonic()
+
+    @property
+    def time_s(self) -> float:
+        """Time so far, by the clock of deadlines [s]."""
+        return self._clock() - self._began_s
+
+    @property
+    def wall_s(self) -> float:
+        """Time so far, by a clock on the wall [s]."""
+        return time.monotonic() - self._began_wall_s
+
+    @contextlib.contextmanager
+    def paused(self) -> Iterator[None]:
+        """Leave out the time of a block."""
+        before_s, before_wall_s = self._clock(), time.monotonic()
+        try:
+            yield
+        finally:
+            self._began_s += self._clock() - before_s
+            self._began_wall_s += time.monotonic() - before_wall_s
+
+
 class Budget:
     """A deadline and limits on the nodes and on the memory of a search."""
 
     def __init__(
         self,
         *,
-        deadline: float | None = None,
+        deadline_s: float | None = None,
         max_nodes: int | None = None,
         max_memory_mb: float = DEFAULT_MEMORY_MB,
         compiled_only: bool = False,
-        clock: Clock = time.monotonic,
+        stopwatch: Stopwatch | None = None,
     ) -> None:
         """Set the limits.
 
         Args:
-            deadline: a reading of `clock`.
+            deadline_s: time on the stopwatch at which the search must end [s].
             max_nodes: limit on nodes.
             max_memory_mb: limit on the arrays of a search.
             compiled_only: whether code that is not compiled yet must not be used.
-            clock: returns the time [s].
+            stopwatch: that of the plan; None: a new one.
         """
-        self._deadline = deadline
+        self._deadline_s = deadline_s
         self._max_nodes = max_nodes
-        self._clock = clock
+        self.stopwatch = stopwatch or Stopwatch()
         self.max_bytes = 1e6 * max_memory_mb
         self.compiled_only = compiled_only
         self.nodes = 0
-        self.paused_s = 0.0
-        """Time that did not count, by the clock of the deadline."""
-        self.paused_wall_s = 0.0
-        """The same by a clock on the wall, for the time that a response reports."""
 
     def check_time(self, ahead_s: float = 0.0) -> None:
         """Raise `BudgetSpentError` if the deadline has passed or is less than `ahead_s` away."""
-        if self._deadline is None:
+        if self._deadline_s is None:
             return
-        if self._clock() + ahead_s + self.nodes * _RELEASE_S_PER_NODE >= self._deadline:
+        release_s = self.nodes * _RELEASE_S_PER_NODE
+        if self.stopwatch.time_s + ahead_s + release_s >= self._deadline_s:
             raise BudgetSpentError
-
-    @contextlib.contextmanager
-    def paused(self) -> Iterator[None]:
-        """Let the time of a block not count: loading code is not part of planning."""
-        began = self._clock(), time.monotonic()
-        try:
-            yield
-        finally:
-            paused_s = self._clock() - began[0]
-            self.paused_s += paused_s
-            self.paused_wall_s += time.monotonic() - began[1]
-            if self._deadline is not None:
-                self._deadline += paused_s
 
     @property
     def left_s(self) -> float:
         """Return the time until the deadline; infinite: there is none."""
-        return math.inf if self._deadline is None else self._deadline - self._clock()
+        return math.inf if self._deadline_s is None else self._deadline_s - self.stopwatch.time_s
 
     def take_node(self) -> None:
         """Count one node, or raise `BudgetSpentError` if none is left."""

@@ -10,7 +10,13 @@ from typing import Final
 
 import attrs
 
-from laneweave.coordinator.planning.budget import DEFAULT_MEMORY_MB, Budget, BudgetSpentError, Clock
+from laneweave.coordinator.planning.budget import (
+    DEFAULT_MEMORY_MB,
+    Budget,
+    BudgetSpentError,
+    Clock,
+    Stopwatch,
+)
 from laneweave.coordinator.planning.kernels import BRANCHING
 from laneweave.coordinator.planning.paper.assignments import Weights
 from laneweave.coordinator.planning.path_map import RelativePathMap
@@ -86,7 +92,7 @@ def plan(
         CacheError: the kernels cannot be compiled, see `kernels`.
         RuntimeError: the plan is invalid because of an error in the planner.
     """
-    started, began_s = clock(), time.monotonic()
+    stopwatch = Stopwatch(clock)
     original, request = request, request.resolved()
     requested = solver or request.solver
     check_solver(requested)
@@ -98,32 +104,27 @@ def plan(
         order = tuple(name for name in order if name != BRANCHING.name) or ("tappa",)
     results: list[_Result] = []
     for name in order:
-        before = clock(), time.monotonic()
-        available = _load(name, compiled_only=compiled_only)
-        started += clock() - before[0]  # loading code is not part of planning
-        began_s += time.monotonic() - before[1]
+        with stopwatch.paused():
+            available = _load(name, compiled_only=compiled_only)
         if not available:
             continue
         is_limited = name == "tappa" and order[-1] != name
         share = TAPPA_SHARE if is_limited else 1.0
         left = nodes - sum(result.nodes for result in results)
         budget = Budget(
-            deadline=started + share * request.deadline_s,
+            deadline_s=share * request.deadline_s,
             max_nodes=math.ceil(share * left),
             max_memory_mb=max_memory_mb,
             compiled_only=compiled_only,
-            clock=clock,
+            stopwatch=stopwatch,
         )
-        limits = PlanLimits(
-            max(PLUG_IN_SHARE * (started + request.deadline_s - clock()), 0.0), math.ceil(left)
-        )
+        left_s = request.deadline_s - stopwatch.time_s
+        limits = PlanLimits(max(PLUG_IN_SHARE * left_s, 0.0), math.ceil(left))
         results.append(_solve(name, problem, request, weights, budget, limits))
-        started += budget.paused_s
-        began_s += budget.paused_wall_s
         if results[-1].found.finished or not (results[-1].found.aborted or is_limited):
             break
-    rest = Budget(deadline=started + request.deadline_s, clock=clock)
-    response = _response(request, problem, requested or results[0].solver, results, rest, began_s)
+    rest = Budget(deadline_s=request.deadline_s, stopwatch=stopwatch)
+    response = _response(request, problem, requested or results[0].solver, results, rest)
     if original.structure is not None:
         response = attrs.evolve(response, targets=request.targets)
     problems = problems_of_response(original, response)
@@ -184,7 +185,6 @@ def _response(
     requested: str,
     results: Sequence[_Result],
     budget: Budget,
-    began_s: float,
 ) -> PlanResponse:
     """Combine the results of the solvers: the cheapest path set and the highest lower bound."""
     searches = [result.found for result in results]
@@ -206,7 +206,7 @@ def _response(
         steps=None if best is None else path_map.steps,
         assignment=() if best is None else best.assignment,
         paths=path_map.rows,
-        solve_ms=round(1e3 * (time.monotonic() - began_s), 3),
+        solve_ms=round(1e3 * budget.stopwatch.wall_s, 3),
         assignments_tried=sum(search.tried for search in searches),
         nodes_expanded=sum(result.nodes for result in results),
         solver=last,

@@ -6,13 +6,12 @@ The trees are exactly the paper's if these are small, otherwise those of the imp
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Iterator, Sequence
 from typing import Final, Literal
 
 import attrs
 
-from laneweave.coordinator.planning.budget import Budget
+from laneweave.coordinator.planning.budget import Budget, Stopwatch
 from laneweave.coordinator.planning.paper.assignments import Weights
 from laneweave.coordinator.planning.paper.cbs import ConstraintTree, Improvements, Node
 from laneweave.coordinator.planning.paper.constraints import entry
@@ -105,11 +104,16 @@ class Explanation:
 
 def explain(request: PlanRequest) -> Explanation:
     """Run Algorithm 1 on a request and return the record of the run."""
-    deadline, weights = time.monotonic() + request.deadline_s, Weights.for_mode(request.mode)
+    stopwatch, weights = Stopwatch(), Weights.for_mode(request.mode)
     problem = request.problem()
 
     def recorded(improvements: Improvements, max_nodes: int) -> Tappa:
-        budget = Budget(deadline=deadline, max_nodes=max_nodes, compiled_only=True)
+        budget = Budget(
+            deadline_s=request.deadline_s,
+            max_nodes=max_nodes,
+            compiled_only=True,
+            stopwatch=stopwatch,
+        )
         tappa = Tappa(request, problem, weights, budget, improvements, record=True)
         tappa.run()
         return tappa

@@ -156,7 +156,7 @@ class Tappa(Search):
 
     def _new_joint_search(self) -> JointSearch | None:
         """Return the joint search, or None if it is not compiled and must not be."""
-        with self._budget.paused():
+        with self._budget.stopwatch.paused():
             if not BRANCHING.available(compiled_only=self._budget.compiled_only):
                 return None
             from laneweave.coordinator.planning.exact.joint_search import (  # noqa: PLC0415

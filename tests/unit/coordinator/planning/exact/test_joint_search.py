@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from laneweave.coordinator.planning.budget import Budget, BudgetSpentError
+from laneweave.coordinator.planning.budget import Budget, BudgetSpentError, Stopwatch
 from laneweave.coordinator.planning.exact import joint_search
 from laneweave.coordinator.planning.exact.joint_search import JointSearch
 from laneweave.coordinator.planning.grid import Grid
@@ -114,7 +114,7 @@ def test_many_vehicles_that_take_all_targets_have_one_goal() -> None:
 
 def test_it_stops_at_the_deadline_and_may_go_on() -> None:
     clock = CountingClock(0.001)
-    search = JointSearch(*crowded(), Budget(deadline=0.003, clock=clock))
+    search = JointSearch(*crowded(), Budget(deadline_s=0.003, stopwatch=Stopwatch(clock)))
     with pytest.raises(BudgetSpentError):
         search.work(10_000_000)
     assert not search.ended

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 
 from laneweave.coordinator.planning import conflict_kinds
-from laneweave.coordinator.planning.budget import Budget, BudgetSpentError
+from laneweave.coordinator.planning.budget import Budget, BudgetSpentError, Stopwatch
 from laneweave.coordinator.planning.conflict_kinds import ConflictModel, Move
 from laneweave.coordinator.planning.exact.reachability import (
     Reachability,
@@ -61,7 +61,7 @@ def test_a_truncated_search_has_no_result() -> None:
 
 def test_time_is_checked() -> None:
     problem = PUZZLE.problem()
-    budget = Budget(deadline=3.0, clock=CountingClock(1.0))
+    budget = Budget(deadline_s=3.0, stopwatch=Stopwatch(CountingClock(1.0)))
     with pytest.raises(BudgetSpentError):
         explore(problem, PUZZLE.choices(), budget, max_moves=10**9)
 
