@@ -758,6 +758,7 @@ def _service() -> str:
         for table in (
             _service_load(measured["load"]),
             _service_added(measured["half"]),
+            _service_turns(measured["turns"]),
             _service_loss(measured["loss"]),
             _service_cancel(measured["cancel"]),
             _service_flood(measured["flood"], measured["road"]),
@@ -835,6 +836,18 @@ def _service_added(runs: list[dict[str, Any]]) -> Iterator[str]:
             f"| {run['sizes'][0]} to {run['sizes'][1]} vehicles, {_workers(run)} "
             f"| {run['requests']} | {solve['p50']:.1f} / {solve['p99']:.1f} ms "
             f"| {added['p50']:.1f} / {added['p95']:.1f} / {added['p99']:.1f} ms |"
+        )
+
+
+def _service_turns(runs: list[dict[str, Any]]) -> Iterator[str]:
+    yield "| small requests one after the other | rate | beyond solving p50 / p99 | added p50 |"
+    yield "|---|---|---|---|"
+    for run in runs:
+        beyond, added = run["beyond_solving_ms"], run["added_ms"]
+        clients = f"{run['clients']} client{'s' if run['clients'] > 1 else ''}"
+        yield (
+            f"| {clients}, 2 workers | {run['rate_per_s']:.0f} per s "
+            f"| {beyond['p50']:.1f} / {beyond['p99']:.1f} ms | {added['p50']:.1f} ms |"
         )
 
 
