@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import json
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
 import pytest
 from attrs import field, frozen
 
 from laneweave.protocol.errors import MAX_PROBLEMS, BadInputError
 from laneweave.protocol.field_validators import within
-from laneweave.protocol.structuring import KEY, NumberOrRange, structure, without
+from laneweave.protocol.structuring import KEY, NumberOrRange, json_form, structure, without
 from support.refusals import refusal
 from support.tables import for_each
 
@@ -210,3 +212,30 @@ def test_without_removes_fields() -> None:
     assert data == {"a": [{"b": 1, "c": 2}], "d": 3}
     with pytest.raises(LookupError):
         without(data, ["a[1].b"])
+
+
+class Cell(NamedTuple):
+    """A tuple with names."""
+
+    column: int
+    lane: int
+
+
+@frozen
+class Grid:
+    """What the JSON form consists of."""
+
+    cells: frozenset[Cell]
+    parts: tuple[Part, ...]
+    size: float
+    name: str | None = None
+
+
+def test_the_json_form_consists_of_maps_and_sorted_lists() -> None:
+    grid = Grid(frozenset({Cell(2, 0), Cell(1, 1)}), (Part(1.0, "a"),), np.float64(0.5))
+    cells, parts = [[1, 1], [2, 0]], [{"size": 1.0, "name": "a"}]
+    form = {"cells": cells, "parts": parts, "size": 0.5}
+    assert json_form(grid) == form | {"name": None}
+    assert json_form(grid, lambda _, value: value is not None) == form
+    assert json_form([*grid.parts, {2, 1}]) == [*parts, [1, 2]]
+    assert json.loads(json.dumps(json_form(grid))) == json_form(grid)

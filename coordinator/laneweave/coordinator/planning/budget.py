@@ -40,12 +40,12 @@ class Stopwatch:
 
     @property
     def wall_s(self) -> float:
-        """Time so far, by a clock on the wall [s]."""
+        """Real time so far [s]."""
         return time.monotonic() - self._began_wall_s
 
     @contextlib.contextmanager
     def paused(self) -> Iterator[None]:
-        """Leave out the time of a block."""
+        """Leave out the time of a block; blocks must not be nested."""
         before_s, before_wall_s = self._clock(), time.monotonic()
         try:
             yield
@@ -73,7 +73,7 @@ class Budget:
             max_nodes: limit on nodes.
             max_memory_mb: limit on the arrays of a search.
             compiled_only: whether code that is not compiled yet must not be used.
-            stopwatch: that of the plan; None: a new one.
+            stopwatch: stopwatch of the plan; None: one is started.
         """
         self._deadline_s = deadline_s
         self._max_nodes = max_nodes

@@ -68,15 +68,15 @@ _NODES_BETWEEN = 8
 _MANY_VEHICLES = 20
 """Formation size from which a path set is sought first, since the search takes long."""
 _FIRST_WORK, _WORK_FOR_GAP = 200, 300
-"""Maximum number of negotiation passes per call until a path set is found; afterwards, their number
-at a gap of 100 %."""
+"""Maximum number of negotiation passes per call until a path set is found; afterwards, with more
+than `_FEW_VEHICLES` vehicles, the number of additional passes at a gap of 100 %."""
 _EXPLORE_NODES, _EXPLORE_MOVES, _MAX_EXPLORE_MOVES, _GROWTH = 16, 5_000, 1_500_000, 4
 """Nodes after which reachable states are explored if no path set is known, and the initial and
 maximum limit on joint moves; nodes and limit grow by the factor `_GROWTH`."""
 _TIE_NODES = 10
 _FIRST_JOINT_MOVES, _JOINT_MOVES = 20_000, 200_000
-"""Moves that the joint search tries in its first turn, doubled with each turn, and at most; turns
-come every `_NODES_BETWEEN` nodes."""
+"""Moves of the joint search in its first turn, and the maximum: each turn has twice as many as the
+one before. There is a turn every `_NODES_BETWEEN` nodes."""
 _CALL_WORK = 8
 _BYTES_PER_S = 1_000_000_000
 """Approximate speed at which arrays are filled."""

@@ -11,7 +11,7 @@ from laneweave.coordinator.planning.random_kernel import random_below
 NOT_IN_TIME = 1_000_000
 """Cost of failing to arrive within the horizon, and of a clique used by a fixed vehicle."""
 _DETOUR = 10.0
-"""Cost of each step still needed to reach the target at the end of the horizon."""
+"""Cost of each step on the way to a target that is too far for the remaining steps."""
 _FIRST_COST, _GROWTH, _MAX_COST = 2.0, 1.01, 50.0
 """Cost of a clique that another vehicle uses: initial value, growth per pass, maximum."""
 _HISTORY = 1.0
@@ -214,7 +214,8 @@ def improve_paths(arrays, teams, candidate, attempts, max_size):
 def _negotiate_among(arrays, teams, candidate, chosen, max_cost, max_delay):
     """Negotiate paths for removed vehicles around fixed others; return whether it succeeded.
 
-    max_cost: maximum sum of their costs. max_delay: by how much it exceeds that of shortest paths.
+    max_cost: maximum sum of their costs.
+    max_delay: `max_cost` minus the costs of their shortest paths, the longest delay of one vehicle.
     """
     use, own, weight = candidate.use, candidate.own, candidate.weight
     path, start, cost, pair = candidate.path, teams.start, candidate.cost, teams.pair
@@ -234,8 +235,8 @@ def _negotiate_among(arrays, teams, candidate, chosen, max_cost, max_delay):
                 add_uses(arrays, start[i], path[i], own, -1.0)
                 add_uses(arrays, start[i], path[i], weight, -cost_of_use)
             shortest = teams.distance[start[i], pair[teams.team[i], candidate.target[i]]]
-            most = min(steps, int(shortest + max_delay))
-            _find_path(arrays, teams, candidate, i, most)
+            max_steps = min(steps, int(shortest + max_delay))
+            _find_path(arrays, teams, candidate, i, max_steps)
             if candidate.cost_to_go[0, start[i]] >= NOT_IN_TIME:
                 return False
             add_uses(arrays, start[i], path[i], own, 1.0)
@@ -246,10 +247,10 @@ def _negotiate_among(arrays, teams, candidate, chosen, max_cost, max_delay):
         if total > max_cost:
             return False
         solved = True
-        more = (_ROUND_GROWTH - 1.0) * cost_of_use
+        added_cost = (_ROUND_GROWTH - 1.0) * cost_of_use
         for t in range(steps):
             for clique in range(cliques):
-                weight[t, clique] += more * own[t, clique]
+                weight[t, clique] += added_cost * own[t, clique]
                 if own[t, clique] > 1.5:
                     solved = False
                     weight[t, clique] += _ROUND_HISTORY

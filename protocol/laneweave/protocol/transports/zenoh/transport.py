@@ -1,7 +1,7 @@
 """The transport over Zenoh; the only module that imports zenoh.
 
 Every process is a client of one router, which is also a Python process. Scouting and gossip are
-off; only the router listens. Callbacks only enqueue. docs/PROTOCOL.md explains the settings of each
+off; only the router listens. Callbacks only enqueue, or complete a future. docs/PROTOCOL.md explains the settings of each
 topic.
 """
 
@@ -218,6 +218,8 @@ class ZenohTransport:
         Returns:
             A future for the first answer. Its result is None if the key has no server, or if all
             have declined, exited or disconnected. It raises `TimeoutError` if none answers in time.
+            Its callbacks run in Zenoh's thread: they must return at once, and neither close the
+            session nor wait for another answer.
         """
         first: Future[Answer | None] = Future()
         first.set_running_or_notify_cancel()
@@ -229,7 +231,7 @@ class ZenohTransport:
         try:
             self._session.get(
                 key,
-                # The binding starts a thread for each indirect callback, which takes 0.1 ms.
+                # The binding would start a thread for an indirect callback, which takes 0.1 ms.
                 zenoh.handlers.Callback(take, lambda: _settle(first, None), indirect=False),
                 payload=payload,
                 encoding=encoding or None,
