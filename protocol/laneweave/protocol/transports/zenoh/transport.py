@@ -1,8 +1,8 @@
 """The transport over Zenoh; the only module that imports zenoh.
 
 Every process is a client of one router, which is also a Python process. Scouting and gossip are
-off; only the router listens. Callbacks only enqueue, or complete a future. docs/PROTOCOL.md explains the settings of each
-topic.
+off; only the router listens. Callbacks only enqueue, or complete a future. docs/PROTOCOL.md
+explains the settings of each topic.
 """
 
 from __future__ import annotations
