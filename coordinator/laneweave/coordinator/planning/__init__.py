@@ -18,6 +18,7 @@ clock that is passed in.
 | parallel and interlaced structure | `formation_structures` |
 
 Additions: improvements to TAPPA (`paper.cbs.Improvements`), a record of its run
-(`paper.explanation`), branch and bound and a joint search (`exact`), the planner for rolling
-operation (`rolling`), and conflicts computed from sizes and motions (`geometry`).
+(`paper.explanation`), branch and bound and a joint search (`exact`), one vehicle after another
+(`prioritized`), the planner for rolling operation (`rolling`), and conflicts computed from sizes
+and motions (`geometry`).
 """

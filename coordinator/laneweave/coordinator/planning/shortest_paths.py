@@ -149,28 +149,28 @@ def without_needless_moves(problem: Problem, solution: Solution, budget: Budget)
         for vehicle in range(len(solution.paths)):
             try:
                 budget.check_time()
+                solution = _reroute(problem, solution, vehicle, budget)
             except BudgetSpentError:
                 return solution
-            solution = _reroute(problem, solution, vehicle)
         if solution == before:
             return solution
 
 
-def _reroute(problem: Problem, solution: Solution, vehicle: int) -> Solution:
+def _reroute(problem: Problem, solution: Solution, vehicle: int, budget: Budget) -> Solution:
     bans = Bans()
     for other, path in enumerate(solution.paths):
         if other != vehicle:
-            _ban_conflicts(problem, bans, path, problem.targets[solution.assignment[other]])
+            ban_conflicts(problem, bans, path, problem.targets[solution.assignment[other]])
     target = problem.targets[solution.assignment[vehicle]]
     diagram = paths_of(problem, vehicle, target, bans)
     if diagram is None:
         return solution
-    path = choose_path(problem.table, diagram, [0] * diagram.cost)
+    path = choose_path(problem.table, diagram, [0] * diagram.cost, budget)
     paths = (*solution.paths[:vehicle], path, *solution.paths[vehicle + 1 :])
     return Solution(solution.assignment, paths)
 
 
-def _ban_conflicts(problem: Problem, bans: Bans, path: Path, target: int) -> None:
+def ban_conflicts(problem: Problem, bans: Bans, path: Path, target: int) -> None:
     """Ban all moves that conflict with a path or with waiting at its target afterwards."""
     conflicts = problem.table.conflicts
     for step, move in enumerate(path):

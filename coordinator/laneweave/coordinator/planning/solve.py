@@ -18,12 +18,13 @@ from laneweave.coordinator.planning.budget import (
     Stopwatch,
 )
 from laneweave.coordinator.planning.kernels import BRANCHING
-from laneweave.coordinator.planning.paper.assignments import Weights
+from laneweave.coordinator.planning.paper.assignments import Weights, assignments, matrices
 from laneweave.coordinator.planning.path_map import RelativePathMap
 from laneweave.coordinator.planning.plan_validator import problems_of_response
 from laneweave.coordinator.planning.plug_ins.registry import PLANNERS, PlanLimits, check_solver
 from laneweave.coordinator.planning.plug_ins.search import PluggedInSearch
-from laneweave.coordinator.planning.problem import Problem, Search
+from laneweave.coordinator.planning.prioritized import prioritized
+from laneweave.coordinator.planning.problem import Problem, Search, Solution
 from laneweave.coordinator.planning.request import PlanRequest
 from laneweave.coordinator.planning.response import PlanResponse, Status
 from laneweave.coordinator.planning.shortest_paths import without_needless_moves
@@ -35,11 +36,6 @@ With more vehicles than the joint search can plan, TAPPA needs 3 to 5 s of CPU f
 share of a scenario's default limit; branching needs 0.1 s for formations of six to eight (95th
 percentile), at most 0.6 s.
 """
-SPARSE_CELLS: Final = 20
-"""Free cells per vehicle above which TAPPA plans first, unless a solver is named: conflicts are
-rare, and branching needs arrays over all cells and steps."""
-FEW_VEHICLES: Final = 10
-"""Minimum number of vehicles for this threshold, so that small grids are left to branching."""
 PLUG_IN_SHARE: Final = 0.5
 """Share of the deadline for a planner of a user; if it fails, built-in solvers need the rest."""
 MAX_NODES: Final = 500_000
@@ -124,6 +120,9 @@ def plan(
         if results[-1].found.finished or not (results[-1].found.aborted or is_limited):
             break
     rest = Budget(deadline_s=request.deadline_s, stopwatch=stopwatch)
+    done = [one for one in results if one.found.finished or one.found.best is not None]
+    if problem.is_sparse and not done:
+        results[-1].found.best = _prioritized(problem, request, weights, rest)
     response = _response(request, problem, requested or results[0].solver, results, rest)
     if original.structure is not None:
         response = attrs.evolve(response, targets=request.targets)
@@ -134,13 +133,15 @@ def plan(
 
 
 def _order(requested: str | None, problem: Problem, *, fallback: bool) -> tuple[str, ...]:
-    """Return the solvers in the order in which to run them."""
+    """Return the solvers in the order in which to run them.
+
+    Where conflicts are rare, TAPPA plans first: branching needs arrays over all cells and steps.
+    """
     if requested is not None and not PLANNERS.is_built_in(requested):
         return (requested, *_order(None, problem, fallback=fallback))
     if problem.table.model.vehicles_share_cells:
         return ("tappa",)
-    is_sparse = problem.table.cell_count > SPARSE_CELLS * max(len(problem.starts), FEW_VEHICLES)
-    if requested == "tappa" or (requested is None and is_sparse):
+    if requested == "tappa" or (requested is None and problem.is_sparse):
         return ("tappa", "branching") if fallback else ("tappa",)
     return ("branching", "tappa")
 
@@ -177,6 +178,17 @@ def _solve(
         search.run()
         found = Search(**attrs.asdict(search, recurse=False))
     return _Result(solver, budget.nodes, found)
+
+
+def _prioritized(
+    problem: Problem, request: PlanRequest, weights: Weights, budget: Budget
+) -> Solution | None:
+    """Return a path set by prioritized planning for the cheapest assignment; None: none found."""
+    with suppress(BudgetSpentError):
+        assignment = next(assignments(*matrices(request, problem, weights, budget), budget), None)
+        if assignment is not None:
+            return prioritized(problem, assignment.targets, budget)
+    return None
 
 
 def _response(
