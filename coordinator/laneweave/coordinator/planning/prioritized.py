@@ -34,8 +34,13 @@ def prioritized(problem: Problem, targets: Sequence[int], budget: Budget) -> Sol
     Raises:
         BudgetSpentError: the deadline has passed.
     """
-    free = [free_paths(problem, vehicle, target) for vehicle, target in enumerate(targets)]
-    costs = [0 if diagram is None else diagram.cost for diagram in free]
+    costs: list[int] = []
+    for vehicle, number in enumerate(targets):
+        budget.check_time()
+        free = free_paths(problem, vehicle, number)
+        if free is None:
+            return None
+        costs.append(free.cost)
     max_steps = max(costs) + len(targets)
     order = sorted(range(len(targets)), key=lambda vehicle: -costs[vehicle])
     for _ in range(_MAX_ATTEMPTS):

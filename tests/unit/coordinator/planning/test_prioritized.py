@@ -15,7 +15,7 @@ from laneweave.coordinator.planning.plan_validator import problems_of_paths
 from laneweave.coordinator.planning.prioritized import prioritized
 from laneweave.coordinator.planning.request import PlanRequest, VehicleRequest
 from laneweave.coordinator.planning.solve import plan
-from laneweave.protocol.lattice import Mode
+from laneweave.protocol.lattice import Cell, Mode
 from laneweave.protocol.scenario.formation_table import BASE_CONFLICTS
 from support.planning_oracles import CountingClock
 
@@ -61,9 +61,11 @@ def test_a_vehicle_without_a_path_is_the_first_one_of_the_next_attempt() -> None
     assert [len(path) for path in solution.paths] == [7, 2]
 
 
-def test_there_may_be_no_path_set() -> None:
+@pytest.mark.parametrize("blocked", [(), ((1, 0),)])
+def test_there_may_be_no_path_set(blocked: tuple[Cell, ...]) -> None:
+    """Two vehicles cannot pass each other in a single lane; a blocked cell divides it."""
     vehicles = (VehicleRequest("a", (0, 0)), VehicleRequest("b", (3, 0)))
-    request = PlanRequest(Grid(4, 1), 1, ("node", "edge"), vehicles, ((3, 0), (0, 0)))
+    request = PlanRequest(Grid(4, 1, blocked), 1, ("node", "edge"), vehicles, ((3, 0), (0, 0)))
     assert prioritized(request.problem(), (0, 1), Budget()) is None
 
 
