@@ -44,8 +44,8 @@ NumberOrRange = float | tuple[float, float]
 TextOrTexts = str | tuple[str, ...]
 """One text or several."""
 IsGiven = Callable[[str, Any], bool]
-_PLAIN = frozenset({int, str, float, bool, type(None)})
-"""Types of most values in maps, for which nothing else has to be checked."""
+PLAIN_TYPES = frozenset({int, str, float, bool, type(None)})
+"""Types of values that are the same in JSON."""
 KEY = "key"
 """Key of a field's metadata: name of the field in files, where it differs. Python reserves `from`.
 Files may also use the name of the field in Python."""
@@ -294,11 +294,11 @@ def json_form(value: Any, is_given: IsGiven = lambda _, __: True) -> Any:  # noq
         is_given: whether the map contains a field, from its name and value.
     """
     kind = type(value)
-    if kind in _PLAIN:
+    if kind in PLAIN_TYPES:
         return value
     if isinstance(value, tuple | list | frozenset | set):
         items = sorted(value) if isinstance(value, frozenset | set) else value
-        return [item if type(item) in _PLAIN else json_form(item, is_given) for item in items]
+        return [item if type(item) in PLAIN_TYPES else json_form(item, is_given) for item in items]
     if not attrs.has(kind):
         return value
     return {

@@ -223,7 +223,7 @@ class Cell(NamedTuple):
 
 @frozen
 class Grid:
-    """What the JSON form consists of."""
+    """Values of all kinds that the JSON form can contain."""
 
     cells: frozenset[Cell]
     parts: tuple[Part, ...]

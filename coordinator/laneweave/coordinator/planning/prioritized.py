@@ -1,4 +1,4 @@
-"""Prioritized planning: one vehicle after another, around those before it.
+"""Prioritized planning: vehicles are planned one after another, each around those before it.
 
 Where conflicts are rare it soon finds a path set, without a bound on its cost (Erdmann and
 Lozano-Pérez, On multiple moving objects, Algorithmica 2, 1987).
@@ -11,11 +11,7 @@ from typing import Final
 
 from laneweave.coordinator.planning.budget import Budget
 from laneweave.coordinator.planning.problem import Bans, Diagram, MoveTable, Path, Problem, Solution
-from laneweave.coordinator.planning.shortest_paths import (
-    ban_conflicts,
-    free_paths,
-    paths_of,
-)
+from laneweave.coordinator.planning.shortest_paths import ban_conflicts, free_paths, paths_of
 
 _MAX_ATTEMPTS: Final = 10
 

@@ -25,9 +25,9 @@ from laneweave.protocol.lattice import Cell, Mode, displacements
 Path = tuple[int, ...]
 """The moves of one vehicle until its final arrival."""
 
-SPARSE_CELLS: Final = 20
+_SPARSE_CELLS: Final = 20
 """Free cells per vehicle above which conflicts are rare."""
-FEW_VEHICLES: Final = 10
+_FEW_VEHICLES: Final = 10
 """Minimum number of vehicles for this threshold, so that small grids do not count as sparse."""
 _MAX_LOOPED_BITS: Final = 1 << 10
 """Size in bits above which taking bits off one by one is slow, because each copies the rest."""
@@ -311,7 +311,7 @@ class Problem:
     @property
     def is_sparse(self) -> bool:
         """Whether the grid has so many free cells that conflicts are rare."""
-        return self.table.cell_count > SPARSE_CELLS * max(len(self.starts), FEW_VEHICLES)
+        return self.table.cell_count > _SPARSE_CELLS * max(len(self.starts), _FEW_VEHICLES)
 
     def is_too_long(self, solution: Solution) -> bool:
         """Return whether a path set has more steps than are permitted."""

@@ -38,7 +38,7 @@ from laneweave.protocol.errors import (
 from laneweave.protocol.lattice import Cell, Mode, displacements
 from laneweave.protocol.names import NAME_PATTERN, NAME_RULE
 from laneweave.protocol.scenario.formation_table import CONFLICT_KINDS, DEFAULT_CONFLICTS
-from laneweave.protocol.structuring import json_form, structure, without
+from laneweave.protocol.structuring import PLAIN_TYPES, json_form, structure, without
 
 REQUEST_SCHEMA: Final = "laneweave.plan.request/1"
 DEFAULT_DEADLINE_S: Final = 4.0
@@ -53,7 +53,6 @@ MAX_STEPS: Final = 10_000
 """Maximum number of steps of a plan, where it is limited."""
 
 _KNOWN_KEYS: Final = "only known keys"
-_SCALARS: Final = (int, str, float, bool)
 _NOT_BOTH: Final = "structure or targets, not both"
 
 
@@ -259,13 +258,13 @@ def _json_problems(parent: str, value: object) -> Iterator[BadInputError]:
                 yield BadInputError(prefix + shown, item, _KNOWN_KEYS)
             elif item is None:
                 yield BadInputError(prefix + key, None, "a value, or no such key")
-            elif key != "geometry" and type(item) not in _SCALARS:
+            elif key != "geometry" and type(item) not in PLAIN_TYPES:
                 yield from _json_problems(prefix + key, item)
     elif isinstance(value, list | tuple):
         for i, item in enumerate(value):
             if item is None:
                 yield BadInputError(f"{parent}[{i}]", None, "a value, or no such key")
-            elif type(item) not in _SCALARS:
+            elif type(item) not in PLAIN_TYPES:
                 yield from _json_problems(f"{parent}[{i}]", item)
 
 

@@ -1,4 +1,4 @@
-"""Prioritized planning: legal path sets soon on sparse grids, where solvers have none in time."""
+"""Prioritized planning finds legal path sets on sparse grids where solvers have none in time."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from support.planning_oracles import CountingClock
 def own_targets(
     grid: Grid, vehicles: int, *, mode: Mode = 1, seed: int = 0, deadline_s: float = 10.0
 ) -> PlanRequest:
-    """Return a request in which each vehicle has a target of its own, far away."""
+    """Return a request in which each vehicle has a target of its own, at random."""
     rng = random.Random(seed)
     cells = [*product(range(grid.columns), range(grid.lanes))]
     starts, targets = rng.sample(cells, vehicles), rng.sample(cells, vehicles)
@@ -52,13 +52,13 @@ def test_nearly_always_there_is_a_path_set_and_it_is_legal(mode: Mode) -> None:
 
 
 def test_a_vehicle_without_a_path_is_the_first_one_of_the_next_attempt() -> None:
-    """The vehicle with the long path passes the alcove before the other one can leave its way."""
+    """The vehicle with the long path would enter the cell that the other one is leaving."""
     blocked = frozenset((column, 1) for column in range(8) if column != 2)
-    vehicles = (VehicleRequest("long", (0, 0)), VehicleRequest("short", (3, 0)))
-    request = PlanRequest(Grid(8, 2, blocked), 1, ("node", "edge"), vehicles, ((7, 0), (2, 1)))
+    vehicles = (VehicleRequest("long", (0, 0)), VehicleRequest("short", (1, 0)))
+    request = PlanRequest(Grid(8, 2, blocked), 1, BASE_CONFLICTS, vehicles, ((7, 0), (2, 1)))
     solution = prioritized(request.problem(), (0, 1), Budget())
     assert solution is not None
-    assert [len(path) for path in solution.paths] == [7, 2]
+    assert [len(path) for path in solution.paths] == [8, 2]
 
 
 @pytest.mark.parametrize("blocked", [(), ((1, 0),)])

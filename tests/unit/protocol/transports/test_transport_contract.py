@@ -261,7 +261,7 @@ class ZenohBed:
         self._processes[name] = start_process(
             MEMBER, self.router.endpoint, str(LEASE_S), token_key(name), PLAN_SERVICE
         )
-        # Its declarations may reach the router after it is ready.
+        # The router may receive its declarations after the process has reported that it is ready.
         observer = self.join("observer")
         observer.transport.watch(token_key(name))
         self.until(observer.tokens)

@@ -134,25 +134,24 @@ def teams(
     numbers: dict[tuple[frozenset[int], frozenset[int]], int] = {}
     members = zip(choices, excluded, strict=True)
     team = [numbers.setdefault(member, len(numbers)) for member in members]
-    pairs = [(k, j) for k, (choice, _) in enumerate(numbers) for j in sorted(choice)]
     sizes = [len(choice) for choice, _ in numbers]
     pairs_from = np.array([*accumulate(sizes, initial=0)], dtype=np.int64)
-    pair_team, pair_target = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
+    numbered = [j for choice, _ in numbers for j in sorted(choice)]
+    pair_target = np.array(numbered, dtype=np.int64)
     pair = np.full((len(numbers), len(targets)), -1, dtype=np.int64)
-    pair[pair_team, pair_target] = range(len(pairs))
+    pair[np.repeat(np.arange(len(numbers)), sizes), pair_target] = range(len(numbered))
     target = _cells(targets, arrays)
     pair_cell = target[pair_target]
     drives = np.repeat(arrays.valid[None], len(numbers), axis=0)
     for k, (_, excluded_of_team) in enumerate(numbers):
-        if excluded_of_team:
-            drives[k, sorted(excluded_of_team)] = False
+        drives[k, sorted(excluded_of_team)] = False
     return Teams(
         start=_cells(starts, arrays),
         team=np.array(team, dtype=np.int64),
         drives=drives,
         target=target,
         pairs_from=pairs_from,
-        pair_target=np.ascontiguousarray(pair_target),
+        pair_target=pair_target,
         pair_cell=pair_cell,
         pair=pair,
         distance=min_steps(drives, arrays.step, pairs_from, pair_cell),

@@ -174,7 +174,11 @@ class Relaxation:
     def _begin_below(
         self, allowed: Bools, earliest: Ints, multipliers: Floats, upper_bound: float
     ) -> float:
-        """Begin, and forbid what no solution below an upper bound contains; return the bound."""
+        """Begin, and forbid moves that no solution below an upper bound contains.
+
+        Returns:
+            The lower bound.
+        """
         bound, self._span = begin_below(
             self.arrays,
             self.teams,

@@ -407,9 +407,9 @@ def _excess(multipliers, use, span):
 
 @njit(cache=True, nogil=True)
 def begin_below(arrays, teams, allowed, earliest, multipliers, scratch, state, upper_bound):
-    """Begin, and forbid what no solution below the upper bound contains.
+    """Call `begin`, and forbid moves and arrivals that no solution below the upper bound contains.
 
-    Returns the lower bound and the span; see `begin` and `fix_by_reduced_cost`.
+    Returns the lower bound, and the number of steps up to the last one with a move before that.
     """
     _, span = begin(arrays, allowed, multipliers, scratch, state)
     bound, _ = fix_by_reduced_cost(

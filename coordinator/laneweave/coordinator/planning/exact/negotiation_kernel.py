@@ -88,8 +88,8 @@ def _find_path(arrays, teams, candidate, i, steps):
 
 
 @njit(cache=True)
-def add_uses(arrays, start, path, use, times):
-    """Add `times` to the uses, or weights, of each clique on a path; -1 removes a use."""
+def add_uses(arrays, start, path, use, amount):
+    """Add an amount to the number of uses, or to the weight, of each clique on a path."""
     clique, step = arrays.clique, arrays.step
     cell = start
     for t in range(len(path)):
@@ -98,7 +98,7 @@ def add_uses(arrays, start, path, use, times):
             r = clique[d, cell, m]
             if r < 0:
                 break
-            use[t, r] += times
+            use[t, r] += amount
         cell += step[d]
 
 
