@@ -76,8 +76,10 @@ def plan(
         solver: name of a solver or plug-in, overriding the request's; if neither names one, one
             is chosen (docs/PLANNING.md, "Which solver plans").
         fallback: branching continues when TAPPA has spent `TAPPA_SHARE`, and the cheaper path set
-            is returned; False: TAPPA may spend the whole budget. A solver that cannot handle the
-            request at all, or a plug-in without a valid plan, is always replaced by others.
+            is returned; where conflicts are rare and neither has one, prioritized planning looks
+            for one. False: TAPPA may spend the whole budget, and plans alone. A solver that cannot
+            handle the request at all, or a plug-in without a valid plan, is always replaced by
+            others.
         compiled_only: without the compiled kernels of branching, TAPPA answers instead, without its
             joint search; False: they are compiled when they are needed, so that the plan does not
             depend on them.
@@ -120,10 +122,13 @@ def plan(
         if results[-1].found.finished or not (results[-1].found.aborted or is_limited):
             break
     rest = Budget(deadline_s=request.deadline_s, stopwatch=stopwatch)
-    done = [one for one in results if one.found.finished or one.found.best is not None]
-    if problem.is_sparse and not done:
-        results[-1].found.best = _prioritized(problem, request, weights, rest)
-    response = _response(request, problem, requested or results[0].solver, results, rest)
+    searches = [result.found for result in results]
+    found = [search.best for search in reversed(searches) if search.best is not None]
+    best = min(found, key=lambda solution: solution.cost, default=None)
+    finished = any(search.finished for search in searches)
+    if fallback and problem.is_sparse and best is None and not finished:
+        best = _prioritized(problem, request, weights, rest)
+    response = _response(request, problem, requested or results[0].solver, results, best, rest)
     if original.structure is not None:
         response = attrs.evolve(response, targets=request.targets)
     problems = problems_of_response(original, response)
@@ -196,12 +201,11 @@ def _response(
     problem: Problem,
     requested: str,
     results: Sequence[_Result],
+    best: Solution | None,
     budget: Budget,
 ) -> PlanResponse:
-    """Combine the results of the solvers: the cheapest path set and the highest lower bound."""
+    """Combine the best path set, if there is one, with the highest lower bound of the solvers."""
     searches = [result.found for result in results]
-    found = [search.best for search in reversed(searches) if search.best is not None]
-    best = min(found, key=lambda solution: solution.cost, default=None)
     is_own = PLANNERS.is_built_in(results[-1].solver)  # paths of a plug-in stay as they are
     if best is not None and is_own and not any(search.has_fewest_moves for search in searches):
         best = without_needless_moves(problem, best, budget)

@@ -83,4 +83,4 @@ def test_a_large_request_has_a_plan_where_no_solver_finds_one_in_time() -> None:
     assert response.cost is not None
     assert (response.lower_bound or 0) <= response.cost
     alone = plan(attrs.evolve(request, solver="tappa"), clock=CountingClock(0.5), fallback=False)
-    assert alone.cost is None or alone.cost <= response.cost
+    assert (alone.status, alone.solver) == ("timeout", "tappa")
