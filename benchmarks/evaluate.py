@@ -1,7 +1,7 @@
 """Run the evaluation and update docs/EVALUATION.md.
 
-    python benchmarks/evaluate.py [--only PART ...] [--seeds A:B] [--budget MINUTES]
-                                    [--jobs N] [--duration S] [--sweeps DIR ...] [--out DIR]
+    python benchmarks/evaluate.py [--only PART ...] [--labels LABEL ...] [--seeds A:B]
+                [--budget MINUTES] [--jobs N] [--duration S] [--sweeps DIR ...] [--out DIR]
 
 zenoh      three points of the sweep over Zenoh with a process per vehicle, and simulated
 speed      real-time factors of three deployments
@@ -11,8 +11,9 @@ sweep      every method at every volume, one seed after the other
 report     docs/evidence/evaluation.json, figures in docs/images, tables in docs/EVALUATION.md
 faults     benchmarks/resilience.py, over an hour; only on request
 
-Finished parts are kept: the same command continues where it stopped. With --budget the sweep starts
-no seed that would not finish in time. The exit status is 1 if a run of formation control violates a
+Finished parts are kept: the same command continues where it stopped. With --labels the sweep runs
+only these methods, and the report replaces only their rows. With --budget the sweep starts no seed
+that would not finish in time. The exit status is 1 if a run of formation control violates a
 guarantee or a run does not finish.
 """
 
@@ -29,7 +30,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from evaluation.conduct import Rounds, refresh, run_trials, say
-from evaluation.programme import DURATION_S, SEEDS
+from evaluation.programme import DURATION_S, LABELS, SEEDS
 from laneweave.launch.cli.options import check_jobs, parse_seeds
 from laneweave.protocol.errors import BadInputError, CommandFailedError
 
@@ -42,18 +43,16 @@ REPORT_S = 300.0
 """Part of the budget reserved for the report."""
 
 
-def parse_parts(names: Sequence[str] | None) -> tuple[str, ...]:
-    """Return the parts to run, in their order; None: all parts that run without request.
+def parse_names(option: str, names: Sequence[str], known: Sequence[str]) -> tuple[str, ...]:
+    """Return the given names in the order of the known ones.
 
     Raises:
-        BadInputError: a part does not exist.
+        BadInputError: a name is not known.
     """
-    if names is None:
-        return tuple(part for part in PARTS if part not in ON_REQUEST)
     for name in names:
-        if name not in PARTS:
-            raise BadInputError("--only", name, "some of " + ", ".join(PARTS))
-    return tuple(part for part in PARTS if part in names)
+        if name not in known:
+            raise BadInputError(option, name, "some of " + ", ".join(known))
+    return tuple(name for name in known if name in names)
 
 
 def parse_positive(option: str, text: str, unit: str) -> float:
@@ -93,12 +92,14 @@ def run(arguments: argparse.Namespace) -> bool:
         BadInputError: an option or a folder is not valid.
         CommandFailedError: files or processes cannot be created.
     """
-    parts, out = parse_parts(arguments.only), Path(arguments.out)
+    parts, out = parse_names("--only", arguments.only, PARTS), Path(arguments.out)
+    labels = parse_names("--labels", arguments.labels, LABELS)
     end_s = None
     if arguments.budget is not None:
         budget_s = 60.0 * parse_positive("--budget", arguments.budget, "minutes")
         end_s = time.monotonic() + budget_s - REPORT_S
     rounds = Rounds(
+        labels=labels,
         seeds=parse_seeds(arguments.seeds),
         duration_s=parse_positive("--duration", arguments.duration, "seconds"),
         jobs=check_jobs(arguments.jobs),
@@ -110,7 +111,7 @@ def run(arguments: argparse.Namespace) -> bool:
             good &= rounds.run(out)
         elif part == "report":
             say("report")
-            refresh(out, arguments.sweeps, DOCS)
+            refresh(out, arguments.sweeps, labels, DOCS)
             good &= run_script(DOCS / "generate.py")
         elif part == "stability":
             say("stability")
@@ -126,7 +127,16 @@ def run(arguments: argparse.Namespace) -> bool:
 def main() -> int:
     """Run, and return the exit status."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--only", nargs="+", metavar="PART", help=", ".join(PARTS))
+    parser.add_argument(
+        "--only",
+        nargs="+",
+        metavar="PART",
+        default=[part for part in PARTS if part not in ON_REQUEST],
+        help=", ".join(PARTS),
+    )
+    parser.add_argument(
+        "--labels", nargs="+", metavar="LABEL", default=LABELS, help=", ".join(LABELS)
+    )
     parser.add_argument("--seeds", default=f"{SEEDS[0]}:{SEEDS[-1] + 1}", help="seeds of the sweep")
     parser.add_argument("--duration", default=f"{DURATION_S:g}", help="duration of arrivals [s]")
     parser.add_argument(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import threading
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
@@ -44,8 +44,9 @@ def say(text: str) -> None:
 
 @frozen
 class Rounds:
-    """A sweep in rounds: each round runs every method at every volume with one seed."""
+    """A sweep in rounds: each round runs the methods at every volume with one seed."""
 
+    labels: Collection[str]
     seeds: Sequence[int]
     duration_s: float
     """Duration of the arrivals at each point."""
@@ -66,7 +67,7 @@ class Rounds:
         with SweepFolder(out / SWEEP_FOLDER) as folder:
             folder.check_settings(base)
             for seed in self.seeds:
-                points = points_of(base, seed)
+                points = [point for point in points_of(base, seed) if point.label in self.labels]
                 if all(folder.is_finished(point) for point in points):
                     continue
                 began_s = time.monotonic()
@@ -117,12 +118,13 @@ def run_trials(part: str, out: Path, root: Path, jobs: int) -> bool:
     return all(ended)
 
 
-def collect(out: Path, sweeps: Iterable[Path], images: Path) -> Evidence:
+def collect(out: Path, sweeps: Iterable[Path], labels: Collection[str], images: Path) -> Evidence:
     """Return the evidence of the existing runs, and draw their figures.
 
     Args:
         out: the evaluation's folder.
         sweeps: folders of other sweeps; empty: the sweep in `out`, if there is one.
+        labels: labels of the points; figures show all runs.
         images: folder of the figures; figures that are not drawn again are removed.
 
     Raises:
@@ -141,7 +143,7 @@ def collect(out: Path, sweeps: Iterable[Path], images: Path) -> Evidence:
     if not folders:
         return evidence
     runs = list(runs_of(folders))
-    points = point_rows(runs)
+    points = [row for row in point_rows(runs) if row.label in labels]
     pictures = draw_pictures(runs, images)
     names = {picture.name for picture in pictures}
     for path in images.glob(PICTURES):
@@ -152,14 +154,15 @@ def collect(out: Path, sweeps: Iterable[Path], images: Path) -> Evidence:
     )
 
 
-def refresh(out: Path, sweeps: Iterable[Path], docs: Path) -> None:
+def refresh(out: Path, sweeps: Iterable[Path], labels: Collection[str], docs: Path) -> None:
     """Bring docs/evidence/evaluation.json and the figures up to date.
 
-    Parts without runs in the folders keep the recorded values.
+    Parts and labels without runs in the folders keep the recorded values.
 
     Args:
         out: the evaluation's folder.
         sweeps: as in `collect`.
+        labels: as in `collect`.
         docs: folder of the documents.
 
     Raises:
@@ -167,4 +170,5 @@ def refresh(out: Path, sweeps: Iterable[Path], docs: Path) -> None:
     """
     path = docs / "evidence" / "evaluation.json"
     recorded = read_evidence(path)
-    write_evidence(recorded.updated_with(collect(out, sweeps, docs / "images")), path)
+    new = collect(out, sweeps, labels, docs / "images")
+    write_evidence(recorded.updated_with(new), path)

@@ -13,6 +13,7 @@ from evaluation.points import Key, PointRow
 from evaluation.programme import FORMATIONS
 from evaluation.trials import AgreementRow, CostRow, FactorRow
 from laneweave.launch.recordings.runs import Run
+from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.files import write_atomically
 from laneweave.protocol.structuring import structure
 
@@ -66,11 +67,21 @@ class Evidence:
     def updated_with(self, new: Evidence) -> Evidence:
         """Return a copy in which the parts of newer evidence replace the present ones.
 
-        Points, their setting and their pictures are one part: they come from the same runs.
+        Points replace those of the same labels.
+
+        Raises:
+            BadInputError: points of other labels have another setting.
         """
         kept = self
         if new.points:
-            kept = evolve(kept, setting=new.setting, points=new.points, pictures=new.pictures)
+            labels = {row.label for row in new.points}
+            others = tuple(row for row in self.points if row.label not in labels)
+            if others and new.setting != self.setting:
+                names = ", ".join(sorted({row.label for row in others}))
+                raise BadInputError("setting", new.setting, f"{self.setting}, as for {names}")
+            kept = evolve(
+                kept, setting=new.setting, points=(*others, *new.points), pictures=new.pictures
+            )
         return evolve(
             kept,
             agreements=new.agreements or kept.agreements,

@@ -209,19 +209,38 @@ def test_evidence_is_what_was_written(tmp_path: Path) -> None:
         read_evidence(path)
 
 
-def test_parts_without_new_runs_are_kept() -> None:
+def test_parts_and_labels_without_new_runs_are_kept() -> None:
     old = full()
     new = Evidence(factors=old.factors[:1])
     assert old.updated_with(new) == evolve(old, factors=old.factors[:1])
     points = evidence(point("rule", 1000.0, 70.0))
     updated_with = old.updated_with(points)
-    assert (updated_with.points, updated_with.pictures) == (points.points, ())
+    others = [row for row in old.points if row.label != "rule"]
+    assert len(others) < len(old.points)
+    assert sorted(updated_with.points, key=lambda row: row.label) == sorted(
+        [*others, *points.points], key=lambda row: row.label
+    )
+    assert updated_with.pictures == ()
     assert updated_with.costs == old.costs
+
+
+def test_points_of_other_settings_are_not_mixed() -> None:
+    new = evidence(point("rule", 1000.0, 70.0))
+    assert new.setting is not None
+    longer = evolve(new, setting=evolve(new.setting, duration_s=900.0))
+    with pytest.raises(BadInputError, match=r"duration_s=600\.0.* as for formations"):
+        full().updated_with(longer)
+    assert new.updated_with(longer) == longer
 
 
 @for_each(
     "options",
-    [("--only", "everything"), ("--budget", "soon"), ("--only", "report", "--sweeps", "nowhere")],
+    [
+        ("--only", "everything"),
+        ("--labels", "lc2014"),
+        ("--budget", "soon"),
+        ("--only", "report", "--sweeps", "nowhere"),
+    ],
 )
 def test_bad_options_are_refused_in_one_line(
     options: tuple[str, ...],
