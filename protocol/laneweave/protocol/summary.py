@@ -26,6 +26,10 @@ SUMMARY_FILE = "summary.json"
 SCHEMA = "laneweave.summary/1"
 HARD_BRAKE_MPS2 = 5.0
 """Deceleration beyond which vehicles are counted as braking hard."""
+TTC_SHORT_S, TTC_CRITICAL_S = 3.0, 1.5
+"""Times to collision below which the time that vehicles spend is summed (Hayward 1972)."""
+MAX_COMFORTABLE_ACCEL_MPS2, MAX_COMFORTABLE_JERK_MPS3 = 2.0, 2.5
+"""Acceleration and jerk beyond which a ride counts as uncomfortable."""
 
 
 def figure(meaning: str, unit: str = "", default: object = attrs.NOTHING) -> Any:  # noqa: ANN401
@@ -132,6 +136,50 @@ class Safety:
     commands_refused: int | None = optional(
         "commands that motion controllers refused, as no correct agent sends them"
     )
+    min_ttc_s: float | None = optional(
+        "minimum time to collision of two vehicles in line; absent: none approached another", "s"
+    )
+    ttc_below_3_s: float | None = optional(
+        f"time that vehicles spent below {TTC_SHORT_S:g} s to collision, summed over vehicles", "s"
+    )
+    ttc_below_1_5_s: float | None = optional(
+        f"the same below {TTC_CRITICAL_S:g} s to collision", "s"
+    )
+    drac_max_mps2: float | None = optional(
+        "maximum deceleration rate to avoid a crash, (difference of speeds)^2 / (2 gap)", "m/s2"
+    )
+    min_pet_s: float | None = optional(
+        "minimum post-encroachment time at a lane change: from the moment at which a vehicle "
+        "reaches into a lane until the next one behind is where its rear was, or until it is "
+        "itself where the rear of the next one ahead was; absent: none below 10 s",
+        "s",
+    )
+
+
+@frozen(kw_only=True)
+class Comfort:
+    """Accelerations and jerks along the road, over all vehicles and ticks; None: no vehicle."""
+
+    accel_rms_mps2: float | None = figure("root mean square of accelerations", "m/s2")
+    accel_p95_mps2: float | None = figure("95th percentile of their absolute values", "m/s2")
+    jerk_rms_mps3: float | None = figure("root mean square of jerks", "m/s3")
+    jerk_p95_mps3: float | None = figure("95th percentile of their absolute values", "m/s3")
+    uncomfortable_percent: float | None = figure(
+        f"share of time with more than {MAX_COMFORTABLE_ACCEL_MPS2:g} m/s2 or "
+        f"{MAX_COMFORTABLE_JERK_MPS3:g} m/s3",
+        "%",
+    )
+
+
+@frozen(kw_only=True)
+class EnergyFigures:
+    """Energy and emissions of all vehicles per km driven, if they were of one type of car."""
+
+    model: str = figure("SUMO's emission class")
+    co2_g_per_km: float = figure("carbon dioxide", "g/km")
+    nox_mg_per_km: float = figure("nitrogen oxides", "mg/km")
+    fuel_g_per_km: float = figure("fuel", "g/km")
+    electricity_wh_per_km: float = figure("electric energy", "Wh/km")
 
 
 @frozen(kw_only=True)
@@ -260,6 +308,10 @@ class RunSummary:
         "veh/(lane h)",
     )
     safety: Safety
+    comfort: Comfort | None = optional("comfort of passengers")
+    energy: dict[str, EnergyFigures] | None = optional(
+        "by type of car (petrol, diesel, electric); absent without the package eclipse-sumo"
+    )
     ending: str | None = optional(
         "complete: all demanded vehicles have left; limit: runtime.max_road_s was reached; "
         "interrupted: the run was stopped, or something failed; unfinished: the run goes on, or "
@@ -310,7 +362,7 @@ class RunSummary:
 def described(kind: type = RunSummary, prefix: str = "") -> Iterator[tuple[str, str, str]]:
     """Yield (path, unit, meaning) of each field that contains a value, parts separated by dots.
 
-    `*` in a path stands for the name of an entrance, a destination or a type of vehicle.
+    `*` in a path stands for the name of an entrance, a destination, or a type of vehicle or car.
     """
     for one in attrs.fields(attrs.resolve_types(kind)):
         if not one.metadata.get(IN_FILE, True):

@@ -12,9 +12,11 @@ from collections.abc import Iterator
 from laneweave.launch.run_methods import FORMATION
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.operations import ROLLING_SOLVER
-from laneweave.protocol.scenario.timing import COMFORT_MPS2
 from laneweave.protocol.summary import (
     HARD_BRAKE_MPS2,
+    MAX_COMFORTABLE_ACCEL_MPS2,
+    MAX_COMFORTABLE_JERK_MPS3,
+    TTC_SHORT_S,
     Ending,
     ObstacleFigures,
     Planning,
@@ -35,7 +37,7 @@ def summary_rows(summary: RunSummary, scenario: Scenario | None = None) -> list[
     """
     preferences = scenario is None or bool(scenario.flow.lane_shares)
     rows = [*_demand_rows(summary, scenario), *_traffic_rows(summary, preferences=preferences)]
-    rows += _safety_rows(summary.safety)
+    rows += [*_safety_rows(summary.safety), *_comfort_rows(summary)]
     if summary.planning.plans or summary.tracking.solves or summary.failover.leader_changes:
         rows += [*_planning_rows(summary.planning), *_control_rows(summary)]
     return [*rows, *_runtime_rows(summary), *_fault_rows(summary)]
@@ -100,21 +102,41 @@ def _safety_rows(safety: Safety) -> Iterator[Row]:
     yield from _numbers(
         ("smallest gap", safety.min_gap_m, " m"),
         ("smallest headway", safety.min_headway_s, " s"),
+        ("smallest time to collision", safety.min_ttc_s, " s"),
+        ("smallest post-encroachment time of a lane change", safety.min_pet_s, " s"),
         ("lowest acceleration", safety.min_accel_mps2, _accel_unit(safety.min_accel_mps2)),
         ("highest acceleration", safety.max_accel_mps2, _accel_unit(safety.max_accel_mps2)),
     )
     if safety.hard_brakes:
         yield f"braked with more than {HARD_BRAKE_MPS2:g} m/s²", f"{safety.hard_brakes} vehicles"
     yield "emergency brakes", f"{safety.emergency_brakes:,}"
+    if safety.ttc_below_3_s:
+        yield f"time below {TTC_SHORT_S:g} s to collision", f"{safety.ttc_below_3_s:.1f} s"
     if safety.commands_refused:
         yield "refused commands of agents", f"{safety.commands_refused:,}"
 
 
+def _comfort_rows(summary: RunSummary) -> Iterator[Row]:
+    if summary.comfort is not None:
+        accel, jerk = f"{MAX_COMFORTABLE_ACCEL_MPS2:g} m/s²", f"{MAX_COMFORTABLE_JERK_MPS3:g} m/s³"
+        yield from _numbers(
+            ("acceleration, root mean square", summary.comfort.accel_rms_mps2, " m/s²"),
+            ("jerk, root mean square", summary.comfort.jerk_rms_mps3, " m/s³"),
+            (f"time beyond {accel} or {jerk}", summary.comfort.uncomfortable_percent, " %"),
+        )
+    for name, own in (summary.energy or {}).items():
+        if own.electricity_wh_per_km:
+            yield f"energy, {name} cars", f"{own.electricity_wh_per_km:.1f} Wh/km"
+        if own.fuel_g_per_km:
+            figures = f"{own.fuel_g_per_km:.1f} g/km, CO2 {own.co2_g_per_km:.1f} g/km"
+            yield f"fuel, {name} cars", figures
+
+
 def _accel_unit(value: float | None) -> str:
     """Return the unit of an acceleration, with a remark if it is uncomfortable."""
-    if value is None or round(abs(value), 2) <= COMFORT_MPS2:
+    if value is None or round(abs(value), 2) <= MAX_COMFORTABLE_ACCEL_MPS2:
         return " m/s²"
-    return f" m/s², beyond comfort ({COMFORT_MPS2:g} m/s²)"
+    return f" m/s², beyond comfort ({MAX_COMFORTABLE_ACCEL_MPS2:g} m/s²)"
 
 
 def _planning_rows(planning: Planning) -> Iterator[Row]:

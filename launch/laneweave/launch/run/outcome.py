@@ -14,9 +14,11 @@ from rich.table import Table
 
 from laneweave.coordinator.planning.plug_ins.registry import PLANNERS
 from laneweave.launch.faults.failover import Failover
+from laneweave.launch.recordings.energy import energy_of
 from laneweave.launch.recordings.runs import scenario_of
 from laneweave.launch.report.summary_table import summary_rows
 from laneweave.launch.run_methods import FORMATION, REFERENCE_METHODS
+from laneweave.protocol.errors import BadInputError, CommandFailedError
 from laneweave.protocol.summary import Ending, RunSummary, read_summary, write_summary
 from laneweave.protocol.wire.obstacle_messages import BREAKDOWN
 
@@ -97,6 +99,10 @@ def complete_summary(
         if interrupted:
             raise KeyboardInterrupt
         return Outcome(folder, None, (*problems, "the run wrote no summary"))
+    try:
+        energy = energy_of(folder)
+    except (BadInputError, CommandFailedError) as error:
+        energy, problems = None, (*problems, str(error))
     measured = summary.failover
     if failover is not None:
         measured = evolve(
@@ -109,6 +115,7 @@ def complete_summary(
         runtime=evolve(summary.runtime, processes=processes),
         messages=evolve(summary.messages, dropped_by_faults=dropped),
         failover=measured,
+        energy=energy,
         faults=faults if faults is not None else summary.faults,
         plug_ins=_plug_ins(summary) or None,
     )

@@ -14,8 +14,8 @@ from laneweave.protocol.scenario.vehicle_tables import PEAK_ACCEL, Vehicle
 
 SHORTEST_CYCLE_S, LONGEST_CYCLE_S = 4.0, 7.0
 """Range of T_F if `formation.cycle_s` is not set; the lower end is the paper's value."""
-COMFORT_MPS2 = 3.0
-"""Maximum comfortable acceleration, along and across the road."""
+GENTLE_MPS2 = 3.0
+"""Maximum acceleration of moves within the comfortable T_F, along and across the road."""
 ROLLING_CYCLE_S = 6.0
 MIN_MERGING_SLOTS = 4
 """Number of slots that the rolling operation should have in a lane that begins and ends on the
@@ -100,9 +100,9 @@ class Timing:
 
     @property
     def comfortable_cycle_s(self) -> float:
-        """Shortest T_F [s] in which no move exceeds `COMFORT_MPS2`, or the longest."""
+        """Shortest T_F [s] in which no move exceeds `GENTLE_MPS2`, or the longest."""
         formation = self._formation
-        min_s = math.sqrt(PEAK_ACCEL * formation.gap_m / COMFORT_MPS2)
+        min_s = math.sqrt(PEAK_ACCEL * formation.gap_m / GENTLE_MPS2)
         comfortable = [slot_s for slot_s in self.slots_s if slot_s >= min_s + formation.slack_s]
         return min(comfortable, default=self.slots_s[-1])
 

@@ -66,6 +66,7 @@ from laneweave.sim_bridge.bodies.command_checks import Refusal
 from laneweave.sim_bridge.bodies.motion_controller import FallbackLevel
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import MinGaps
 from laneweave.sim_bridge.recording.disk import Disk
+from laneweave.sim_bridge.recording.driving_measures import DrivingMeasures
 from laneweave.sim_bridge.recording.events import Events
 from laneweave.sim_bridge.recording.leadership import Leadership
 from laneweave.sim_bridge.recording.missed_lanes import MissedLanes, leaderless_after_s
@@ -164,6 +165,7 @@ class RunRecord:
         self._save_at_s = time.monotonic() + FIRST_SAVE_S
         """Time at which everything is saved next."""
         self._disk = disk = Disk()
+        self._measures = DrivingMeasures(scenario)
         metadata = metadata_of(scenario)
         try:
             folder.mkdir(parents=True, exist_ok=True)
@@ -172,8 +174,7 @@ class RunRecord:
                 folder / "trajectories.parquet",
                 metadata,
                 scenario.lattice,
-                max(own.limits.min_accel_mps2 for own in scenario.types.values()),
-                self._min_accel_of if scenario.vehicle_type else None,
+                self._measures,
                 disk,
             )
             self._trips = Trips(folder / "trips.parquet", metadata, disk)
@@ -226,6 +227,8 @@ class RunRecord:
         trip.entered_s, trip.formation = vehicle.entered_s, vehicle.formation
         # One from outside may have changed lanes since it was demanded.
         trip.arrival = vehicle.arrival
+        own_type = self._scenario.types[vehicle.arrival.vehicle_type]
+        self._measures.enter(vehicle.name, own_type.limits)
         self.event(
             vehicle.entered_s,
             ENTERED,
@@ -248,11 +251,6 @@ class RunRecord:
             vehicles=list(members),
             columns=[columns[0], columns[-1]],
         )
-
-    def _min_accel_of(self, vehicle: str) -> float:
-        """Return the braking limit of a vehicle on the road [m/s2]."""
-        arrival = self._trips[Name(vehicle)].arrival
-        return self._scenario.types[arrival.vehicle_type].limits.min_accel_mps2
 
     def on_left(self, vehicle: RecordedVehicle, t_s: float, *, attended: bool) -> None:
         """Record a vehicle that has left the road since the last tick, by its end or an exit.
@@ -450,6 +448,7 @@ class RunRecord:
             travel_time_s=travel_time(trips),
             throughput_veh_per_lane_h=throughput(trips, scenario.road.lanes),
             safety=evolve(self._trajectories.safety(), commands_refused=self._counts.refused),
+            comfort=self._trajectories.comfort(),
             ending=ending.value,
             obstacles=self._obstacles.figures,
             recorded_until_s=None if self._disk.works else round(self._recorded_s, 6),

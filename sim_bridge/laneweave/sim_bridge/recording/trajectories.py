@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -13,10 +13,11 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from laneweave.protocol.lattice import Lattice
-from laneweave.protocol.summary import HARD_BRAKE_MPS2, Safety
+from laneweave.protocol.summary import TTC_CRITICAL_S, TTC_SHORT_S, Comfort, Safety
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import MinGaps
 from laneweave.sim_bridge.recording.columns import TRAJECTORIES, Metadata
 from laneweave.sim_bridge.recording.disk import Disk
+from laneweave.sim_bridge.recording.driving_measures import DrivingMeasures, Rows
 from laneweave.sim_bridge.recording.growing_parquet import GrowingParquet
 from laneweave.sim_bridge.recording.statistics import finite
 
@@ -24,8 +25,6 @@ ROWS_PER_GROUP = 100_000
 """Number of rows that are written together."""
 TICKS_PER_GROUP = 3000
 """Maximum number of ticks whose rows are written together."""
-EMERGENCY_SHARE = 0.9
-"""Fraction of the braking limit beyond which braking counts as emergency braking."""
 
 Sample = tuple[str, float, float, float, float, float, int | None, int | None, int]
 """(vehicle, s [m], y [m], speed [m/s], lateral speed [m/s], acceleration [m/s2], reserved column,
@@ -58,15 +57,14 @@ def body_cells(
 
 
 class Trajectories:
-    """Writes trajectories and computes their extreme values."""
+    """Writes trajectories and measures safety and comfort."""
 
     def __init__(
         self,
         path: Path,
         metadata: Metadata,
         lattice: Lattice,
-        min_accel_mps2: float,
-        min_accel_of: Callable[[str], float] | None = None,
+        measures: DrivingMeasures,
         disk: Disk | None = None,
     ) -> None:
         """Open the file.
@@ -75,8 +73,7 @@ class Trajectories:
             path: the file.
             metadata: its metadata.
             lattice: the lattice of the scenario.
-            min_accel_mps2: braking limit of the type that brakes least.
-            min_accel_of: returns the braking limit of a vehicle; None: it is that of all.
+            measures: receives all trajectories.
             disk: errors of its disk.
         """
         self.peak = 0
@@ -94,38 +91,16 @@ class Trajectories:
         self._times: list[float] = []
         self._rows: list[Sample] = []
         """Buffered rows; `_times` contains their times."""
+        self._measured_rows = 0
+        """Number of buffered rows that are measured."""
         self._buffered_ticks = 0
-        self._brake_mps2 = EMERGENCY_SHARE * min_accel_mps2
-        self._min_accel_of = min_accel_of
-        self._last_s, self._last_accels = -math.inf, dict[str, float]()
-        """Time of the last tick, and accelerations of all vehicles at that tick."""
+        self._measures = measures
         self._overlaps: set[tuple[str, str]] = set()
         self._collisions: set[tuple[str, str]] = set()
         self._min_gap_m = self._min_headway_s = math.inf
-        self._emergency_brakes = 0
-        self._hard_brakes = set[str]()
-        self._min_accel_mps2, self._max_accel_mps2 = math.inf, -math.inf
-        self._max_jerk_mps3 = -math.inf
 
     def tick(self, t_s: float, rows: list[Sample]) -> None:
         """Record all vehicles on the road; called once per tick."""
-        brake_mps2, last_accels, dt_s = self._brake_mps2, self._last_accels, t_s - self._last_s
-        accels = {row[0]: row[5] for row in rows}
-        for vehicle, accel in accels.items():
-            last = last_accels.get(vehicle)
-            if last is not None and dt_s > 0.0:
-                self._max_jerk_mps3 = max(self._max_jerk_mps3, abs(accel - last) / dt_s)
-            if accel < brake_mps2:
-                own_mps2 = brake_mps2
-                if self._min_accel_of is not None:
-                    own_mps2 = EMERGENCY_SHARE * self._min_accel_of(vehicle)
-                if accel < own_mps2 and (last is None or last >= own_mps2):
-                    self._emergency_brakes += 1
-            if accel < -HARD_BRAKE_MPS2:
-                self._hard_brakes.add(vehicle)
-        self._last_s, self._last_accels = t_s, accels
-        self._min_accel_mps2 = min(self._min_accel_mps2, *accels.values(), math.inf)
-        self._max_accel_mps2 = max(self._max_accel_mps2, *accels.values(), -math.inf)
         self._times += [round(t_s, 6)] * len(rows)
         self._rows += rows
         self.peak = max(self.peak, len(rows))
@@ -152,17 +127,29 @@ class Trajectories:
 
     def safety(self) -> Safety:
         """Return the counts and extreme values so far."""
+        self._measure()
+        found = self._measures
         return Safety(
             overlaps=len(self._overlaps),
             sumo_collisions=len(self._collisions),
             min_gap_m=finite(self._min_gap_m),
             min_headway_s=finite(self._min_headway_s),
-            emergency_brakes=self._emergency_brakes,
-            hard_brakes=len(self._hard_brakes),
-            max_accel_mps2=finite(self._max_accel_mps2),
-            min_accel_mps2=finite(self._min_accel_mps2),
-            max_jerk_mps3=finite(self._max_jerk_mps3),
+            emergency_brakes=found.emergency_brakes,
+            hard_brakes=found.hard_brakes,
+            max_accel_mps2=finite(found.max_accel_mps2),
+            min_accel_mps2=finite(found.min_accel_mps2),
+            max_jerk_mps3=finite(found.max_jerk_mps3),
+            min_ttc_s=finite(found.min_ttc_s),
+            ttc_below_3_s=finite(found.ttc_below_s[TTC_SHORT_S]),
+            ttc_below_1_5_s=finite(found.ttc_below_s[TTC_CRITICAL_S]),
+            drac_max_mps2=finite(found.max_drac_mps2),
+            min_pet_s=finite(found.min_pet_s),
         )
+
+    def comfort(self) -> Comfort | None:
+        """Return accelerations and jerks so far; None: there were no vehicles."""
+        self._measure()
+        return self._measures.comfort
 
     def save(self) -> None:
         """Write the buffered rows as a provisional row group."""
@@ -173,8 +160,18 @@ class Trajectories:
         with closing(self._file):
             self._write_rows()
 
+    def _measure(self) -> None:
+        """Measure the buffered rows that are not measured yet."""
+        rows = self._rows[self._measured_rows :]
+        if rows:
+            vehicles, s_m, y_m, speed_mps, _, accel_mps2, *_ = zip(*rows, strict=True)
+            columns = (self._times[self._measured_rows :], s_m, y_m, speed_mps, accel_mps2)
+            self._measures.add(Rows.of(pa.array(vehicles), *map(np.array, columns)))
+            self._measured_rows = len(self._rows)
+
     def _write_rows(self, *, provisional: bool = False) -> None:
-        """Write the buffered rows as one row group."""
+        """Measure the buffered rows, and write them as one row group."""
+        self._measure()
         if not provisional:
             self._buffered_ticks = 0
         if not self._rows:
@@ -182,7 +179,7 @@ class Trajectories:
         samples = dict(zip(_SAMPLED, zip(*self._rows, strict=True), strict=True))
         values: dict[str, Any] = {"t_s": np.array(self._times), **samples}
         if not provisional:
-            self._times, self._rows = [], []
+            self._times, self._rows, self._measured_rows = [], [], 0
         s_m, y_m = np.array(values["s_m"]), np.array(values["y_m"])
         columns, lanes = body_cells(values["t_s"], s_m, y_m, self._lattice)
         no_lattice = np.array([one is None for one in values["reserved_column"]])

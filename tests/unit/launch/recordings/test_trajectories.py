@@ -13,6 +13,7 @@ from laneweave.launch.recordings.trajectories import NO_LATTICE, read_tracks, re
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.sim_bridge.recording.columns import SCHEMA_KEY, TRAJECTORIES
+from laneweave.sim_bridge.recording.driving_measures import DrivingMeasures
 from laneweave.sim_bridge.recording.trajectories import Sample, Trajectories
 from laneweave.sim_bridge.recording.trips import Trip, metadata_of, trips_table
 from laneweave.sim_bridge.road.demand import Arrival
@@ -31,7 +32,9 @@ def newer(tmp_path: Path) -> Path:
     folder.mkdir()
     trips = [Trip(Arrival(name, 0, lane, 0.0)) for name, lane in (("a", 1), ("b", -1))]
     pq.write_table(trips_table(trips, 0.0, metadata), folder / "trips.parquet")
-    with closing(Trajectories(folder / FILE, metadata, LATTICE, -9.0)) as trajectories:
+    with closing(
+        Trajectories(folder / FILE, metadata, LATTICE, DrivingMeasures(Scenario()))
+    ) as trajectories:
         for tick in range(40):
             t_s, across_mps = 40.0 + 0.1 * tick, LATTICE.lane_width_m / 4.0
             s_m, y_m = LATTICE.cell_s_m(-2, t_s), LATTICE.cell_y_m(0) + across_mps * 0.1 * tick

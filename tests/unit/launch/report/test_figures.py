@@ -39,6 +39,7 @@ from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.road_layout import ANY_LANE
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.road_tables import Closure
+from laneweave.sim_bridge.recording.driving_measures import DrivingMeasures
 from laneweave.sim_bridge.recording.trajectories import Sample, Trajectories
 from laneweave.sim_bridge.recording.trips import Trip, metadata_of, trips_table
 from laneweave.sim_bridge.road.demand import Arrival
@@ -69,7 +70,9 @@ def record(folder: Path, scenario: Scenario, trips: Sequence[Trip]) -> None:
     last_arrival_s = max((trip.arrival.t_s for trip in trips), default=0.0)
     pq.write_table(trips_table(trips, last_arrival_s, metadata), folder / "trips.parquet")
     path, lattice = folder / "trajectories.parquet", scenario.lattice
-    with closing(Trajectories(path, metadata, lattice, -9.0)) as trajectories:
+    with closing(
+        Trajectories(path, metadata, lattice, DrivingMeasures(Scenario()))
+    ) as trajectories:
         for tick in range(1300):
             samples: list[Sample] = []
             for number, trip in enumerate(trips):

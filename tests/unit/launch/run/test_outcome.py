@@ -25,6 +25,13 @@ from support.tables import for_each
 
 MEASURED = ("min_gap_m", "min_headway_s", "max_accel_mps2", "min_accel_mps2", "max_jerk_mps3")
 
+COMFORT = {
+    "accel_rms_mps2": 0.3,
+    "accel_p95_mps2": 0.4,
+    "jerk_rms_mps3": 0.3,
+    "jerk_p95_mps3": 0.5,
+    "uncomfortable_percent": 0.31,
+}
 MANY_RECOVERIES = Failover(1.0, [0.1, 0.2, 0.3, 0.4, 0.5, 0.9], [])
 
 
@@ -163,6 +170,12 @@ def printed(outcome: Outcome) -> str:
             ("time without leader, median", "0.350 s (6 times)"),
         ),
         (summary(), {"failover": MANY_RECOVERIES}, ("time without leader, maximum", "0.900 s")),
+        (
+            make_summary(safety={"min_ttc_s": 2.5, "ttc_below_3_s": 0.7}),
+            {},
+            ("time below 3 s to collision", "0.7 s"),
+        ),
+        (make_summary(comfort=COMFORT), {}, ("time beyond 2 m/s² or 2.5 m/s³", "0.31 %")),
     ],
 )
 def test_the_table_at_the_end(
@@ -260,9 +273,9 @@ def test_the_table_says_which_solvers_planned(more: dict[str, Any], shown: dict[
 @for_each(
     ("low", "high", "said"),
     [
-        (-3.004, 3.0, ("-3.00 m/s²", "3.00 m/s²")),
-        (-3.01, 2.0, ("-3.01 m/s², beyond comfort (3 m/s²)", "2.00 m/s²")),
-        (-1.0, 4.8, ("-1.00 m/s²", "4.80 m/s², beyond comfort (3 m/s²)")),
+        (-2.004, 2.0, ("-2.00 m/s²", "2.00 m/s²")),
+        (-2.01, 1.0, ("-2.01 m/s², beyond comfort (2 m/s²)", "1.00 m/s²")),
+        (-1.0, 4.8, ("-1.00 m/s²", "4.80 m/s², beyond comfort (2 m/s²)")),
         (None, None, (None, None)),
     ],
 )

@@ -25,6 +25,7 @@ from laneweave.sim_bridge.recording.columns import (
     TRIPS,
     Table,
 )
+from laneweave.sim_bridge.recording.driving_measures import DrivingMeasures
 from laneweave.sim_bridge.recording.growing_parquet import GrowingParquet
 from laneweave.sim_bridge.recording.trajectories import Sample, Trajectories
 from laneweave.sim_bridge.recording.trips import (
@@ -64,7 +65,9 @@ def table(*trips: Trip) -> pa.Table:
 
 @pytest.fixture
 def trajectories(tmp_path: Path) -> Trajectories:
-    return Trajectories(tmp_path / "trajectories.parquet", METADATA, LATTICE, -10.0)
+    return Trajectories(
+        tmp_path / "trajectories.parquet", METADATA, LATTICE, DrivingMeasures(Scenario())
+    )
 
 
 def test_trajectories_come_back(
@@ -253,6 +256,9 @@ def test_safety_is_the_worst_of_the_run(trajectories: Trajectories) -> None:
         max_accel_mps2=None,
         min_accel_mps2=None,
         max_jerk_mps3=None,
+        ttc_below_3_s=0.0,
+        ttc_below_1_5_s=0.0,
+        drac_max_mps2=0.0,
     )
     trajectories.distances([("a", "b")], [], MinGaps(4.0, 1.2))
     trajectories.distances([("a", "b"), ("a", "c")], [("a", "b")], MinGaps(3.25, 1.5))

@@ -1,0 +1,144 @@
+"""Energy and emissions of a run, by SUMO's emission models on its speeds and accelerations.
+
+The models are those of HBEFA 4 (Handbook Emission Factors for Road Transport) in SUMO. Its program
+`emissionsDrivingCycle` evaluates them for each row of the trajectories, as if all vehicles were of
+one type; slopes are zero.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+import os
+import subprocess
+import sys
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.csv as pc
+import pyarrow.parquet as pq
+
+from laneweave.launch.recordings.runs import TRAJECTORIES, scenario_of, unreadable
+from laneweave.protocol.errors import CommandFailedError
+from laneweave.protocol.runtime.temporary_folders import temporary_folder
+from laneweave.protocol.summary import EnergyFigures
+
+MODELS: Final[Mapping[str, str]] = {
+    "petrol": "HBEFA4/PC_petrol_Euro-6d",
+    "diesel": "HBEFA4/PC_diesel_Euro-6d",
+    "electric": "HBEFA4/PC_BEV",
+}
+"""SUMO's emission class of each type of car."""
+ROWS_AT_ONCE: Final = 500_000
+_CYCLE: Final = pc.WriteOptions(include_header=False, delimiter=";", quoting_style="none")
+_SUMS: Final = "sums"
+"""Line of the program's output before the sums over all rows, in mg and Wh per second."""
+
+
+def emission_program() -> Path | None:
+    """Return SUMO's program; None: the package eclipse-sumo is not installed."""
+    package = importlib.util.find_spec("sumo")
+    if package is None or package.origin is None:
+        return None
+    suffix = ".exe" if sys.platform == "win32" else ""
+    path = Path(package.origin).parent / "bin" / f"emissionsDrivingCycle{suffix}"
+    return path if path.is_file() else None
+
+
+def energy_of(folder: Path, models: Mapping[str, str] = MODELS) -> dict[str, EnergyFigures] | None:
+    """Return energy and emissions of a run for each type of car.
+
+    None: the package eclipse-sumo is not installed, or no movement was recorded.
+
+    Args:
+        folder: the run's folder.
+        models: SUMO's emission class of each type.
+
+    Raises:
+        BadInputError: the trajectories cannot be read.
+        CommandFailedError: a model does not exist, or its results are not finite.
+    """
+    program = emission_program()
+    if program is None or not (folder / TRAJECTORIES).is_file():
+        return None
+    tick_s = scenario_of(folder / TRAJECTORIES).runtime.tick_s
+    totals = {model: Counter[str]() for model in models.values()}
+    driven_m = 0.0
+    with temporary_folder("energy") as temporary:
+        cycle = temporary / "cycle.csv"
+        for speed_mps, accel_mps2 in _speeds(folder):
+            driven_m += tick_s * float(speed_mps.sum())
+            rows = np.arange(len(speed_mps), dtype=np.float64)
+            columns = [rows, speed_mps, accel_mps2, np.zeros(len(rows))]
+            pc.write_csv(pa.table(columns, names=[*"tvas"]), cycle, _CYCLE)
+            for model, sums in _evaluated(program, cycle, [*totals]):
+                totals[model].update(sums)
+    if not driven_m:
+        return None
+    per_km = tick_s / (driven_m / 1000.0)
+    return {
+        name: EnergyFigures(
+            model=model,
+            co2_g_per_km=round(per_km * totals[model]["CO2"] / 1000.0, 3),
+            nox_mg_per_km=round(per_km * totals[model]["NOx"], 3),
+            fuel_g_per_km=round(per_km * totals[model]["fuel"] / 1000.0, 3),
+            electricity_wh_per_km=round(per_km * totals[model]["electricity"], 3),
+        )
+        for name, model in models.items()
+    }
+
+
+def _speeds(folder: Path) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yield speeds [m/s] and accelerations [m/s2] of a run in parts, without empty ones."""
+    try:
+        with pq.ParquetFile(folder / TRAJECTORIES) as file:
+            names = ["speed_mps", "accel_mps2"]
+            for batch in file.iter_batches(ROWS_AT_ONCE, columns=names):
+                speed_mps, accel_mps2 = (column.to_numpy() for column in batch.columns)
+                yield speed_mps.astype(np.float64), accel_mps2.astype(np.float64)
+    except (OSError, ValueError, KeyError) as error:
+        raise unreadable(folder, TRAJECTORIES, error) from error
+
+
+def _evaluated(
+    program: Path, cycle: Path, models: list[str]
+) -> Iterator[tuple[str, dict[str, float]]]:
+    """Yield each model with its sums over all rows of a driving cycle; the models run side by side.
+
+    Raises:
+        CommandFailedError: a model does not exist, or its results are not finite.
+    """
+    with ExitStack() as running:
+        started = [
+            running.enter_context(
+                subprocess.Popen(  # noqa: S603
+                    [
+                        *(str(program), "--timeline-file", str(cycle)),
+                        *("--emission-class", model, "--output", os.devnull),
+                        *("--output.attributes", "fuel"),  # one column takes half the time
+                    ],
+                    stdout=subprocess.PIPE,
+                    stderr=subprocess.PIPE,
+                    text=True,
+                )
+            )
+            for model in models
+        ]
+        for model, process in zip(models, started, strict=True):
+            output, complaint = process.communicate()
+            if process.returncode:
+                reason = " ".join(complaint.split())
+                raise CommandFailedError(f"emission model {model}: {reason}")
+            lines = output.partition(_SUMS)[2].split()
+            pairs = (line.partition(":") for line in lines if ":" in line)
+            sums = {name: float(value) for name, _, value in pairs}
+            wrong = [name for name, value in sums.items() if not math.isfinite(value)]
+            if wrong or not sums:
+                what = ", ".join(wrong) or "the result"
+                raise CommandFailedError(f"emission model {model}: {what} is not finite")
+            yield model, sums
