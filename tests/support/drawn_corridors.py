@@ -15,7 +15,7 @@ from itertools import pairwise
 from pathlib import Path
 from random import Random
 
-import sumo  # type: ignore[import-untyped]
+import sumo
 from attrs import define, field, frozen
 
 from support import corridor_oracle

@@ -93,6 +93,21 @@ def test_the_tutorial(lab: Lab, clone: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.more
+def test_the_guide_of_exports(lab: Lab, clone: Path) -> None:
+    speeds, changes, energy, _ = follow(lab, "EXPORT.md")
+
+    assert speeds.startswith("minute 0: [")
+    assert changes.startswith("lane changes: vehicles [(1, ")
+    assert [line.partition(":")[0] for line in energy.splitlines()] == [
+        "petrol", "diesel", "electric", "HBEFA4/PC_petrol_Euro-4"
+    ]  # fmt: skip
+    assert (clone / "time-space.png").stat().st_size > 10_000
+    found = {path.name for path in (clone / "runs" / "analysed" / "export").iterdir()}
+    assert {"fcd.xml", "road.net.xml", "run.mcap", "commonroad.xml", "columns.csv"} <= found
+
+
+@pytest.mark.slow
 @pytest.mark.usefixtures("clone")
 @pytest.mark.more
 def test_the_guide_for_python(lab: Lab) -> None:

@@ -89,6 +89,11 @@ COMMANDS = {
         "explain",
         "Tell what happened to a vehicle in a run, and why it missed its lane.",
     ),
+    "export": CommandEntry(
+        "export_command",
+        "export",
+        "Write a recorded run in an open format, and print the names of the files.",
+    ),
     "repair": CommandEntry(
         "study_commands",
         "repair",

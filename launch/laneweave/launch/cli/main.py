@@ -26,6 +26,7 @@ TYPER_INTERRUPTED = 130
 MAX_LINES = 20
 """Maximum number of errors of a file that are printed."""
 SIM_HINT = "the simulation packages: install laneweave[sim]"
+EXPORT_HINT = "the packages of this format: install laneweave[export]"
 WATCH_HINT = "the web server: install laneweave[watch]"
 INSTALL_HINTS = {
     "distributed": "Dask: install laneweave[dask]",
@@ -34,6 +35,8 @@ INSTALL_HINTS = {
     "osqp": "the quadratic-program solver: install laneweave[agent]",
     "cryptography": "the package for certificates: install laneweave[certs]",
     "prometheus_client": "the package for metrics: install laneweave[metrics]",
+    "commonroad": EXPORT_HINT,
+    "foxglove": EXPORT_HINT,
     "starlette": WATCH_HINT,
     "uvicorn": WATCH_HINT,
     "websockets": WATCH_HINT,

@@ -25,6 +25,7 @@ from laneweave.sim_bridge.sumo.road_edges import (
     single_edge,
 )
 
+NETWORK_FILE = "road.net.xml"
 _NO_VEHICLES = "authority"
 """A class of vehicles that do not occur, for lanes that no vehicle may enter or leave sideways."""
 SUBLANE_M = 0.8
@@ -41,7 +42,7 @@ def write_network(scenario: Scenario, folder: Path, *, sumo_drives: bool) -> tup
             one edge with all lanes, and there is one route.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    network, routes = folder / "road.net.xml", folder / "road.rou.xml"
+    network, routes = folder / NETWORK_FILE, folder / "road.rou.xml"
     edges = road_edges(scenario) if sumo_drives else single_edge(scenario)
     for file, lines in (
         (network, _network(scenario, edges, sumo_drives=sumo_drives)),

@@ -1,0 +1,115 @@
+"""The trajectories of a run, tick by tick, with the bodies of its vehicles."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import cached_property
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from attrs import frozen
+
+from laneweave.launch.recordings.runs import single_run
+from laneweave.launch.recordings.trajectories import Floats, Ints, read_trajectories, read_trips
+from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.wire.messages import CAR
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import TURNING_MPS
+
+_COLUMNS = ("s_m", "y_m", "speed_mps", "lateral_speed_mps", "accel_mps2")
+
+
+def within(table: pa.Table, from_s: float | None, to_s: float | None) -> pa.Table:
+    """Return the rows between two road times (`t_s`); None: all that are earlier or later."""
+    if from_s is not None:
+        table = table.filter(pc.greater_equal(table["t_s"], pa.scalar(from_s)))
+    if to_s is not None:
+        table = table.filter(pc.less_equal(table["t_s"], pa.scalar(to_s)))
+    return table
+
+
+@frozen
+class Recording:
+    """All rows of a run in the order of time; arrays of shape (rows,)."""
+
+    folder: Path
+    scenario: Scenario
+    names: tuple[str, ...]
+    """Names of the vehicles."""
+    types: tuple[str, ...]
+    """Type of each vehicle."""
+    vehicle: Ints
+    """Index of each row's vehicle."""
+    t_s: Floats
+    s_m: Floats
+    """Middle of the front bumper."""
+    y_m: Floats
+    """Centre of the body."""
+    speed_mps: Floats
+    heading_rad: Floats
+    """Direction of the body: 0 along the road, positive to the left."""
+    accel_mps2: Floats
+    lane: Ints
+
+    @classmethod
+    def read(cls, folder: Path, from_s: float | None = None, to_s: float | None = None) -> Self:
+        """Return the recording in a run's folder.
+
+        Args:
+            folder: the run's folder.
+            from_s: road time of the first tick; None: the beginning of the run.
+            to_s: road time of the last tick; None: its end.
+
+        Raises:
+            BadInputError: the folder has no readable run, or there are no vehicles in this time.
+        """
+        scenario = single_run(folder).scenario
+        table = read_trajectories(folder, ["t_s", "vehicle", *_COLUMNS, "lane"])
+        table = within(table, from_s, to_s)
+        if not table.num_rows:
+            value = f"{from_s or 0.0:g} to {'the end' if to_s is None else f'{to_s:g}'}"
+            allowed = "a time in which vehicles were on the road"
+            raise BadInputError("--from, --to", value, allowed)
+        codes = table["vehicle"].combine_chunks().dictionary_encode()
+        names = tuple(str(name) for name in codes.dictionary)
+        trips = read_trips(folder)
+        found = {name: np.nan_to_num(table[name].to_numpy()).astype(float) for name in _COLUMNS}
+        ahead_mps = np.maximum(found["speed_mps"], 0.0)
+        turned = np.minimum(ahead_mps / TURNING_MPS, 1.0)
+        return cls(
+            folder=folder,
+            scenario=scenario,
+            names=names,
+            types=tuple(str(trips.get(name, {}).get("vehicle_type", CAR)) for name in names),
+            vehicle=codes.indices.to_numpy().astype(np.int64),
+            t_s=table["t_s"].to_numpy(),
+            s_m=found["s_m"],
+            y_m=found["y_m"],
+            speed_mps=found["speed_mps"],
+            heading_rad=turned * np.arctan2(found["lateral_speed_mps"], ahead_mps),
+            accel_mps2=found["accel_mps2"],
+            lane=table["lane"].to_numpy().astype(np.int64),
+        )
+
+    def ticks(self) -> Iterator[tuple[float, range]]:
+        """Yield the road time and the rows of each tick."""
+        begins = np.flatnonzero(np.diff(self.t_s, prepend=-np.inf)).tolist()
+        for first, end in zip(begins, [*begins[1:], len(self.t_s)], strict=True):
+            yield float(self.t_s[first]), range(first, end)
+
+    def size_m(self, number: int) -> tuple[float, float]:
+        """Return length and width of a vehicle."""
+        return self.scenario.types[self.types[number]].limits.size_m
+
+    @cached_property
+    def lengths_m(self) -> Floats:
+        """Length of each row's vehicle."""
+        return np.array([self.size_m(number)[0] for number in range(len(self.names))])[self.vehicle]
+
+    @cached_property
+    def centres_m(self) -> Floats:
+        """Distance of each body's centre along the road."""
+        return self.s_m - 0.5 * self.lengths_m * np.cos(self.heading_rad)
