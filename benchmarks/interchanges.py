@@ -16,7 +16,7 @@ from itertools import pairwise
 from pathlib import Path
 from random import Random
 
-import sumo  # type: ignore[import-untyped]
+import sumo
 
 NETCONVERT = Path(sumo.SUMO_HOME) / "bin" / "netconvert"
 LANES, LENGTH_M, INTERCHANGES = 3, 8000.0, 3

@@ -12,6 +12,9 @@ from pathlib import Path
 def write_atomically(path: Path, write: str | Callable[[Path], object]) -> None:
     """Write or replace a file atomically: readers never see a partial file.
 
+    Whatever interrupts this leaves no other file; of two processes that write the same file, the
+    last one succeeds.
+
     Args:
         path: the file.
         write: its text, or a function that writes its content to a given path.
@@ -19,14 +22,14 @@ def write_atomically(path: Path, write: str | Callable[[Path], object]) -> None:
     Raises:
         OSError: the disk is full, or fails; the file is as before.
     """
-    part = path.with_suffix(".part")
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         if isinstance(write, str):
             part.write_text(write, encoding="utf-8")
         else:
             write(part)
         part.replace(path)
-    except OSError:
+    except BaseException:
         part.unlink(missing_ok=True)
         raise
 

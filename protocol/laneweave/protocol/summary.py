@@ -146,19 +146,21 @@ class Safety:
         f"the same below {TTC_CRITICAL_S:g} s to collision", "s"
     )
     drac_max_mps2: float | None = optional(
-        "maximum deceleration rate to avoid a crash, (difference of speeds)^2 / (2 gap)", "m/s2"
+        "maximum deceleration rate to avoid a crash, (difference of speeds)^2 / (2 gap); 0: none "
+        "approached another",
+        "m/s2",
     )
     min_pet_s: float | None = optional(
-        "minimum post-encroachment time at a lane change: from the moment at which a vehicle "
-        "reaches into a lane until the next one behind is where its rear was, or until it is "
-        "itself where the rear of the next one ahead was; absent: none below 10 s",
+        "minimum post-encroachment time: when a vehicle reaches into a lane, the time until the "
+        "next one behind is where its rear was, and until it is where the rear of the next one "
+        "ahead was; absent: none below 10 s",
         "s",
     )
 
 
 @frozen(kw_only=True)
 class Comfort:
-    """Accelerations and jerks along the road, over all vehicles and ticks; None: no vehicle."""
+    """Accelerations and jerks along the road, over all vehicles and ticks."""
 
     accel_rms_mps2: float | None = figure("root mean square of accelerations", "m/s2")
     accel_p95_mps2: float | None = figure("95th percentile of their absolute values", "m/s2")
@@ -173,7 +175,7 @@ class Comfort:
 
 @frozen(kw_only=True)
 class EnergyFigures:
-    """Energy and emissions of all vehicles per km driven, if they were of one type of car."""
+    """Energy and emissions per km driven, computed as if all vehicles were cars of one type."""
 
     model: str = figure("SUMO's emission class")
     co2_g_per_km: float = figure("carbon dioxide", "g/km")
@@ -310,7 +312,8 @@ class RunSummary:
     safety: Safety
     comfort: Comfort | None = optional("comfort of passengers")
     energy: dict[str, EnergyFigures] | None = optional(
-        "by type of car (petrol, diesel, electric); absent without the package eclipse-sumo"
+        "by type of car (petrol, diesel, electric); absent without the package eclipse-sumo, or "
+        "if the models failed"
     )
     ending: str | None = optional(
         "complete: all demanded vehicles have left; limit: runtime.max_road_s was reached; "

@@ -1,4 +1,4 @@
-"""Appending to a file that other processes append to."""
+"""Writing files whole, and appending to a file that other processes append to."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from resource import RLIM_INFINITY, RLIMIT_FSIZE, setrlimit
 
 import pytest
 
-from laneweave.protocol.files import append
+from laneweave.protocol.files import append, write_atomically
 
 
 def test_two_writers_append_in_turn(tmp_path: Path) -> None:
@@ -34,3 +34,32 @@ def test_a_line_that_does_not_fit_on_the_disk_is_not_there_in_part(tmp_path: Pat
         setrlimit(RLIMIT_FSIZE, (RLIM_INFINITY, RLIM_INFINITY))
         signal.signal(signal.SIGXFSZ, before)
     assert path.read_bytes() == b"first\n3\n"
+
+
+@pytest.mark.parametrize("error", [OSError, RuntimeError, KeyboardInterrupt])
+def test_what_ends_writing_leaves_the_file_as_it_was(
+    tmp_path: Path, error: type[BaseException]
+) -> None:
+    path = tmp_path / "file.txt"
+    write_atomically(path, "first")
+
+    def fail(part: Path) -> None:
+        part.write_text("half", encoding="utf-8")
+        raise error
+
+    with pytest.raises(error):
+        write_atomically(path, fail)
+    assert [*tmp_path.iterdir()] == [path]
+    assert path.read_text(encoding="utf-8") == "first"
+
+
+def test_files_that_differ_in_their_suffix_are_written_at_once(tmp_path: Path) -> None:
+    """One writer begins while the other one has not finished."""
+
+    def write_both(part: Path) -> None:
+        part.write_text("outer", encoding="utf-8")
+        write_atomically(tmp_path / "run.mcap", "inner")
+
+    write_atomically(tmp_path / "run.xml", write_both)
+    assert (tmp_path / "run.xml").read_text(encoding="utf-8") == "outer"
+    assert (tmp_path / "run.mcap").read_text(encoding="utf-8") == "inner"

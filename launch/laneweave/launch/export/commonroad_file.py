@@ -17,8 +17,10 @@ from commonroad.scenario.obstacle import DynamicObstacle, ObstacleType
 from commonroad.scenario.scenario import Location, Scenario, ScenarioID
 from commonroad.scenario.state import CustomState, InitialState
 from commonroad.scenario.trajectory import Trajectory
+from lxml import etree
 
 from laneweave.launch.export.recording import Recording
+from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.files import write_atomically
 from laneweave.protocol.scenario.fields import Scenario as Road
 from laneweave.protocol.wire.messages import CAR
@@ -36,6 +38,7 @@ def write_commonroad(recording: Recording, path: Path) -> list[Path]:
     the recording; vehicles that are present at a single tick are left out.
 
     Raises:
+        BadInputError: no vehicle is present at two ticks.
         OSError: the file cannot be written.
     """
     tick_s = recording.scenario.runtime.tick_s
@@ -48,19 +51,24 @@ def write_commonroad(recording: Recording, path: Path) -> list[Path]:
         rows = order[bounds[number] : bounds[number + 1]]
         if len(rows) > 1:
             scenario.add_objects(_obstacle(recording, number, rows, steps))
+    if not scenario.dynamic_obstacles:
+        raise BadInputError("--from, --to", "one tick", "at least two ticks")
     writer = CommonRoadFileWriter(
         scenario,
         PlanningProblemSet(),
         author="laneweave",
         affiliation="laneweave",
-        source=f"{recording.folder.name}, seed {recording.scenario.seed}",
+        source=f"simulated road, seed {recording.scenario.seed}",
         tags=set(),
         location=Location(),
     )
 
     def write(part: Path) -> None:
         with contextlib.redirect_stdout(io.StringIO()):  # it prints where it writes
-            writer.write_to_file(str(part), OverwriteExistingFile.ALWAYS)
+            try:
+                writer.write_to_file(str(part), OverwriteExistingFile.ALWAYS)
+            except etree.SerialisationError as error:
+                raise OSError(str(error)) from error
 
     write_atomically(path, write)
     return [path]

@@ -8,8 +8,10 @@ import pyarrow as pa
 import pyarrow.csv as csv
 import pyarrow.parquet as pq
 
-from laneweave.launch.export.recording import within
+from laneweave.launch.export.recording import check_period, within
+from laneweave.launch.recordings.runs import unreadable
 from laneweave.launch.recordings.trajectories import read_trajectories
+from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.files import write_atomically
 from laneweave.sim_bridge.recording.columns import TICKS, TRAJECTORIES, TRIPS
 
@@ -26,14 +28,22 @@ def write_csv(run: Path, folder: Path, from_s: float | None, to_s: float | None)
         to_s: road time of the last ones.
 
     Raises:
-        BadInputError: the trajectories cannot be read.
+        BadInputError: a table cannot be read, or has no rows in this time.
         OSError: a file cannot be written.
     """
+    check_period(from_s, to_s)
     tables = {"trajectories": (TRAJECTORIES, within(read_trajectories(run), from_s, to_s))}
-    if (run / "trips.parquet").is_file():
-        tables["trips"] = (TRIPS, pq.read_table(run / "trips.parquet"))
-    if (run / "ticks.parquet").is_file():
-        tables["ticks"] = (TICKS, within(pq.read_table(run / "ticks.parquet"), from_s, to_s))
+    if not tables["trajectories"][1].num_rows and (from_s, to_s) != (None, None):
+        value = f"{from_s or 0.0:g} to {'the end' if to_s is None else f'{to_s:g}'}"
+        raise BadInputError("--from, --to", value, "a time in which vehicles were on the road")
+    for name, declared in (("trips", TRIPS), ("ticks", TICKS)):
+        file = run / f"{name}.parquet"
+        if file.is_file():
+            try:
+                table = pq.read_table(file)
+            except (OSError, ValueError) as error:
+                raise unreadable(run, file.name, error) from error
+            tables[name] = (declared, table if declared is TRIPS else within(table, from_s, to_s))
     files = [_write(table, folder / f"{name}.csv") for name, (_, table) in tables.items()]
     described = [
         {

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gzip
-import math
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,6 +11,7 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 
 from laneweave.launch.export.recording import Recording
+from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.files import write_atomically
 from laneweave.protocol.runtime.temporary_folders import temporary_folder
 from laneweave.sim_bridge.sumo.network import NETWORK_FILE, write_network
@@ -30,11 +30,11 @@ def write_fcd(recording: Recording, path: Path) -> list[Path]:
     Args:
         recording: the run.
         path: the file; compressed if its name ends with `.gz`. The network is beside it.
+
+    Raises:
+        BadInputError: the file has the name of the network.
+        OSError: a file cannot be written.
     """
-    network = path.parent / NETWORK_FILE
-    with temporary_folder("export") as folder:
-        write_network(recording.scenario, folder, sumo_drives=False)
-        write_atomically(network, lambda part: shutil.copyfile(folder / NETWORK_FILE, part))
 
     def write(part: Path) -> None:
         if path.suffix == ".gz":
@@ -44,47 +44,32 @@ def write_fcd(recording: Recording, path: Path) -> list[Path]:
             with part.open("w", encoding="utf-8") as file:
                 file.writelines(_lines(recording))
 
+    network = path.parent / NETWORK_FILE
+    if path.name == NETWORK_FILE:
+        raise BadInputError("--out", str(path), f"a name other than {NETWORK_FILE}, the network's")
     write_atomically(path, write)
+    with temporary_folder("export") as folder:
+        write_network(recording.scenario, folder, sumo_drives=False)
+        write_atomically(network, lambda part: shutil.copyfile(folder / NETWORK_FILE, part))
     return [path, network]
 
 
 def _lines(recording: Recording) -> Iterator[str]:
     yield '<?xml version="1.0" encoding="UTF-8"?>\n\n<fcd-export>\n'
-    for t_s, rows in recording.ticks():
-        lines = "".join(_vehicle(row) for row in _columns(recording, rows))
-        yield f'    <timestep time="{t_s:.2f}">\n{lines}    </timestep>\n'
-    yield "</fcd-export>\n"
-
-
-Row = tuple[str, str, float, float, float, float, float, int, float]
-
-
-def _columns(recording: Recording, rows: range) -> zip[Row]:
-    """Return name, type, x, y, angle, speed, position, lane and acceleration of each vehicle."""
-    own = slice(rows.start, rows.stop)
-    heading = recording.heading_rad[own]
-    front_y_m = recording.y_m[own] + 0.5 * recording.lengths_m[own] * np.sin(heading)
     edge = single_edge(recording.scenario).road[0]
-    numbers = recording.vehicle[own].tolist()
-    return zip(
-        (quoteattr(recording.names[number]) for number in numbers),
-        (quoteattr(recording.types[number]) for number in numbers),
-        recording.s_m[own].tolist(),
-        front_y_m.tolist(),
-        (90.0 - np.degrees(heading)).tolist(),
-        recording.speed_mps[own].tolist(),
-        (recording.s_m[own] - edge.from_m).tolist(),
-        recording.lane[own].tolist(),
-        recording.accel_mps2[own].tolist(),
-        strict=True,
-    )
-
-
-def _vehicle(row: Row) -> str:
-    name, kind, x_m, y_m, angle, speed_mps, pos_m, lane, accel_mps2 = row
-    angle = math.fmod(angle + 360.0, 360.0)
-    return (
-        f'        <vehicle id={name} x="{x_m:.2f}" y="{y_m:.2f}" angle="{angle:.2f}" type={kind}'
-        f' speed="{speed_mps:.2f}" pos="{pos_m:.2f}" lane="{ROAD}_{lane}" slope="0.00"'
-        f' acceleration="{accel_mps2:.2f}"/>\n'
-    )
+    names = [quoteattr(name) for name in recording.names]
+    types = [quoteattr(name) for name in recording.types]
+    angles = 90.0 - np.degrees(recording.heading_rad)
+    for t_s, rows in recording.ticks():
+        yield f'    <timestep time="{t_s:.3f}">\n'
+        for row in rows:
+            number, s_m, y_m = recording.vehicle[row], recording.s_m[row], recording.front_y_m[row]
+            yield (
+                f'        <vehicle id={names[number]} x="{s_m:.2f}" y="{y_m:.2f}"'
+                f' angle="{angles[row]:.2f}" type={types[number]}'
+                f' speed="{recording.speed_mps[row]:.2f}" pos="{s_m - edge.from_m:.2f}"'
+                f' lane="{ROAD}_{recording.lane[row]}" slope="0.00"'
+                f' acceleration="{recording.accel_mps2[row]:.2f}"/>\n'
+            )
+        yield "    </timestep>\n"
+    yield "</fcd-export>\n"

@@ -6,6 +6,7 @@ from enum import StrEnum
 from pathlib import Path
 
 from laneweave.launch.export.recording import Recording
+from laneweave.launch.recordings.runs import single_run
 from laneweave.protocol.errors import BadInputError, CommandFailedError
 
 FOLDER = "export"
@@ -44,42 +45,51 @@ def export(
         CommandFailedError: a file cannot be written.
         ModuleNotFoundError: the packages of the format are not installed.
     """
-    recording = Recording.read(run, from_s, to_s)
     try:
-        return _write(recording, chosen, out, from_s, to_s)
+        return _write(run, chosen, out, from_s, to_s)
     except OSError as error:
         reason = error.strerror or error
         raise CommandFailedError(f"{error.filename or out or run}: {reason}") from error
 
 
 def _write(
-    recording: Recording,
-    chosen: Format,
-    out: Path | None,
-    from_s: float | None,
-    to_s: float | None,
+    run: Path, chosen: Format, out: Path | None, from_s: float | None, to_s: float | None
 ) -> list[Path]:
-    folder = recording.folder / FOLDER
+    # Each format imports its own packages.
     if chosen is Format.csv:
-        from laneweave.launch.export.csv_tables import write_csv  # noqa: PLC0415 (each its packages)
+        from laneweave.launch.export.csv_tables import write_csv  # noqa: PLC0415
 
-        target = out or folder
-        target.mkdir(parents=True, exist_ok=True)
-        return write_csv(recording.folder, target, from_s, to_s)
+        return write_csv(run, _csv_folder(run, out), from_s, to_s)
+    recording = Recording.read(run, from_s, to_s)
     if chosen is Format.fcd:
         from laneweave.launch.export.fcd import FCD_FILE, write_fcd  # noqa: PLC0415
 
-        return write_fcd(recording, _file(out or folder / FCD_FILE, *FCD_SUFFIXES))
+        return write_fcd(recording, _file(out or run / FOLDER / FCD_FILE, *FCD_SUFFIXES))
     if chosen is Format.mcap:
         from laneweave.launch.export.mcap_file import MCAP_FILE, write_mcap  # noqa: PLC0415
 
-        return write_mcap(recording, _file(out or folder / MCAP_FILE, ".mcap"))
+        path = _file(out or run / FOLDER / MCAP_FILE, ".mcap")
+        return write_mcap(recording, path, from_s, to_s)
     from laneweave.launch.export.commonroad_file import (  # noqa: PLC0415
         COMMONROAD_FILE,
         write_commonroad,
     )
 
-    return write_commonroad(recording, _file(out or folder / COMMONROAD_FILE, ".xml"))
+    return write_commonroad(recording, _file(out or run / FOLDER / COMMONROAD_FILE, ".xml"))
+
+
+def _csv_folder(run: Path, out: Path | None) -> Path:
+    """Return the folder of CSV files, created if necessary.
+
+    Raises:
+        BadInputError: `run` is not the folder of a run, or `out` is a file or has the name of one.
+    """
+    single_run(run)
+    path = out or run / FOLDER
+    if path.is_file() or path.suffix == ".csv":
+        raise BadInputError("--out", str(path), "a folder")
+    path.mkdir(parents=True, exist_ok=True)
+    return path
 
 
 def _file(path: Path, *suffixes: str) -> Path:

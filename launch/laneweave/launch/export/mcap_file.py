@@ -12,8 +12,10 @@ Times are road times; x is along the road, y to the left from its right edge (fr
 from __future__ import annotations
 
 import json
+import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import foxglove
 import numpy as np
@@ -40,6 +42,7 @@ from foxglove.messages import (
 from laneweave.launch.drawing.colours import NEUTRAL, lane_colours
 from laneweave.launch.export.recording import Recording
 from laneweave.launch.recordings.formations import read_events
+from laneweave.launch.recordings.runs import unreadable
 from laneweave.launch.recordings.trajectories import read_trips
 from laneweave.protocol.files import write_atomically
 
@@ -64,36 +67,52 @@ _TRAFFIC: Final = {
 }
 
 
-def write_mcap(recording: Recording, path: Path) -> list[Path]:
+def write_mcap(
+    recording: Recording, path: Path, from_s: float | None, to_s: float | None
+) -> list[Path]:
     """Write a run as an MCAP file; return the file.
 
+    Args:
+        recording: the run.
+        path: the file.
+        from_s: road time of the first events; None: all.
+        to_s: road time of the last ones.
+
     Raises:
-        OSError, ValueError: the events cannot be read, or the file cannot be written.
+        BadInputError: the events cannot be read.
+        OSError: the file cannot be written.
     """
-    write_atomically(path, lambda part: _write(recording, part))
+    first_s, last_s = -math.inf if from_s is None else from_s, math.inf if to_s is None else to_s
+    try:
+        events = [
+            one for one in read_events(recording.folder) if first_s <= float(one["t_s"]) <= last_s
+        ]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise unreadable(recording.folder, "events.jsonl", error) from error
+
+    def write(part: Path) -> None:
+        try:
+            _write(recording, events, part)
+        except RuntimeError as error:  # of the library, also if the disk is full
+            raise OSError(str(error)) from error
+
+    write_atomically(path, write)
     return [path]
 
 
-def _write(recording: Recording, path: Path) -> None:
+def _write(recording: Recording, events: Sequence[Mapping[str, Any]], path: Path) -> None:
     context = foxglove.Context()
     with foxglove.open_mcap(path, allow_overwrite=True, context=context):
-        first_s, last_s = float(recording.t_s[0]), float(recording.t_s[-1])
+        begin_s = float(min([recording.t_s[0], *(float(event["t_s"]) for event in events)]))
         road = SceneUpdateChannel("/road", context=context)
-        road.log(_road(recording, first_s), log_time=_ns(first_s))
-        events = LogChannel("/events", context=context)
-        for event in read_events(recording.folder):
+        road.log(_road(recording, begin_s), log_time=_ns(begin_s))
+        log = LogChannel("/events", context=context)
+        for event in events:
             t_s = float(event["t_s"])
-            if first_s <= t_s <= last_s:
-                text = json.dumps({name: value for name, value in event.items() if name != "t_s"})
-                events.log(
-                    Log(
-                        timestamp=_timestamp(t_s),
-                        level=LogLevel.Info,
-                        message=text,
-                        name=str(event.get("name", event.get("role", ""))),
-                    ),
-                    log_time=_ns(t_s),
-                )
+            text = json.dumps({name: value for name, value in event.items() if name != "t_s"})
+            name = str(event.get("name", event.get("role", "")))
+            entry = Log(timestamp=_timestamp(t_s), level=LogLevel.Info, message=text, name=name)
+            log.log(entry, log_time=_ns(t_s))
         vehicles = SceneUpdateChannel("/vehicles", context=context)
         speeds = PointCloudChannel("/speeds", context=context)
         traffic = foxglove.Channel("/traffic", schema=_TRAFFIC, context=context)
@@ -114,7 +133,7 @@ def _write(recording: Recording, path: Path) -> None:
 
 
 def _ns(t_s: float) -> int:
-    return round(t_s * _NS_PER_S)
+    return max(round(t_s * _NS_PER_S), 0)
 
 
 def _timestamp(t_s: float) -> Timestamp:
@@ -188,7 +207,7 @@ def _bodies(
 def _speeds(recording: Recording, t_s: float, rows: slice) -> PointCloud:
     columns = (
         recording.s_m[rows],
-        recording.y_m[rows],
+        recording.front_y_m[rows],
         np.full(rows.stop - rows.start, HEIGHT_M),
         recording.speed_mps[rows],
         recording.accel_mps2[rows],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
@@ -12,7 +13,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from attrs import frozen
 
-from laneweave.launch.recordings.runs import single_run
+from laneweave.launch.recordings.runs import single_run, unreadable
 from laneweave.launch.recordings.trajectories import Floats, Ints, read_trajectories, read_trips
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.fields import Scenario
@@ -20,6 +21,19 @@ from laneweave.protocol.wire.messages import CAR
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import TURNING_MPS
 
 _COLUMNS = ("s_m", "y_m", "speed_mps", "lateral_speed_mps", "accel_mps2")
+
+
+def check_period(from_s: float | None, to_s: float | None) -> None:
+    """Check a part of a run.
+
+    Raises:
+        BadInputError: a time is not finite, or the first one is after the last one.
+    """
+    for name, value in (("--from", from_s), ("--to", to_s)):
+        if value is not None and not math.isfinite(value):
+            raise BadInputError(name, value, "a road time in s")
+    if from_s is not None and to_s is not None and from_s > to_s:
+        raise BadInputError("--from", f"{from_s:g}", f"at most --to = {to_s:g}")
 
 
 def within(table: pa.Table, from_s: float | None, to_s: float | None) -> pa.Table:
@@ -45,9 +59,9 @@ class Recording:
     """Index of each row's vehicle."""
     t_s: Floats
     s_m: Floats
-    """Middle of the front bumper."""
+    """Distance of the front bumper along the road."""
     y_m: Floats
-    """Centre of the body."""
+    """Distance of the body's centre from the right edge of the road."""
     speed_mps: Floats
     heading_rad: Floats
     """Direction of the body: 0 along the road, positive to the left."""
@@ -66,16 +80,22 @@ class Recording:
         Raises:
             BadInputError: the folder has no readable run, or there are no vehicles in this time.
         """
+        check_period(from_s, to_s)
         scenario = single_run(folder).scenario
         table = read_trajectories(folder, ["t_s", "vehicle", *_COLUMNS, "lane"])
         table = within(table, from_s, to_s)
         if not table.num_rows:
+            if from_s is None and to_s is None:
+                raise BadInputError("RUN", str(folder), "a run with vehicles on the road")
             value = f"{from_s or 0.0:g} to {'the end' if to_s is None else f'{to_s:g}'}"
             allowed = "a time in which vehicles were on the road"
             raise BadInputError("--from, --to", value, allowed)
         codes = table["vehicle"].combine_chunks().dictionary_encode()
         names = tuple(str(name) for name in codes.dictionary)
-        trips = read_trips(folder)
+        try:
+            trips = read_trips(folder)
+        except (OSError, ValueError, KeyError) as error:
+            raise unreadable(folder, "trips.parquet", error) from error
         found = {name: np.nan_to_num(table[name].to_numpy()).astype(float) for name in _COLUMNS}
         ahead_mps = np.maximum(found["speed_mps"], 0.0)
         turned = np.minimum(ahead_mps / TURNING_MPS, 1.0)
@@ -108,6 +128,11 @@ class Recording:
     def lengths_m(self) -> Floats:
         """Length of each row's vehicle."""
         return np.array([self.size_m(number)[0] for number in range(len(self.names))])[self.vehicle]
+
+    @cached_property
+    def front_y_m(self) -> Floats:
+        """Distance of the middle of each front bumper from the right edge of the road."""
+        return self.y_m + 0.5 * self.lengths_m * np.sin(self.heading_rad)
 
     @cached_property
     def centres_m(self) -> Floats:

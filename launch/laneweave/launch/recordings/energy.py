@@ -11,10 +11,8 @@ import importlib.util
 import math
 import os
 import subprocess
-import sys
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack
 from pathlib import Path
 from typing import Final
 
@@ -23,7 +21,7 @@ import pyarrow as pa
 import pyarrow.csv as pc
 import pyarrow.parquet as pq
 
-from laneweave.launch.recordings.runs import TRAJECTORIES, scenario_of, unreadable
+from laneweave.launch.recordings.runs import TRAJECTORIES, unreadable
 from laneweave.protocol.errors import CommandFailedError
 from laneweave.protocol.runtime.temporary_folders import temporary_folder
 from laneweave.protocol.summary import EnergyFigures
@@ -37,7 +35,9 @@ MODELS: Final[Mapping[str, str]] = {
 ROWS_AT_ONCE: Final = 500_000
 _CYCLE: Final = pc.WriteOptions(include_header=False, delimiter=";", quoting_style="none")
 _SUMS: Final = "sums"
-"""Line of the program's output before the sums over all rows, in mg and Wh per second."""
+"""Line of the program's output before the sums."""
+TIMEOUT_S: Final = 300.0
+"""Longest time for `ROWS_AT_ONCE` rows, which take a second."""
 
 
 def emission_program() -> Path | None:
@@ -45,8 +45,7 @@ def emission_program() -> Path | None:
     package = importlib.util.find_spec("sumo")
     if package is None or package.origin is None:
         return None
-    suffix = ".exe" if sys.platform == "win32" else ""
-    path = Path(package.origin).parent / "bin" / f"emissionsDrivingCycle{suffix}"
+    path = Path(package.origin).parent / "bin" / "emissionsDrivingCycle"
     return path if path.is_file() else None
 
 
@@ -62,25 +61,25 @@ def energy_of(folder: Path, models: Mapping[str, str] = MODELS) -> dict[str, Ene
     Raises:
         BadInputError: the trajectories cannot be read.
         CommandFailedError: a model does not exist, or its results are not finite.
+        OSError: there is no room for temporary files, or the program cannot be started.
     """
     program = emission_program()
     if program is None or not (folder / TRAJECTORIES).is_file():
         return None
-    tick_s = scenario_of(folder / TRAJECTORIES).runtime.tick_s
     totals = {model: Counter[str]() for model in models.values()}
-    driven_m = 0.0
+    speeds = 0.0
     with temporary_folder("energy") as temporary:
         cycle = temporary / "cycle.csv"
         for speed_mps, accel_mps2 in _speeds(folder):
-            driven_m += tick_s * float(speed_mps.sum())
+            speeds += float(speed_mps.sum())
             rows = np.arange(len(speed_mps), dtype=np.float64)
             columns = [rows, speed_mps, accel_mps2, np.zeros(len(rows))]
             pc.write_csv(pa.table(columns, names=[*"tvas"]), cycle, _CYCLE)
-            for model, sums in _evaluated(program, cycle, [*totals]):
-                totals[model].update(sums)
-    if not driven_m:
+            for model, total in totals.items():
+                total.update(_sums(program, cycle, model))
+    if not speeds:
         return None
-    per_km = tick_s / (driven_m / 1000.0)
+    per_km = 1000.0 / speeds  # rows are equally far apart in time
     return {
         name: EnergyFigures(
             model=model,
@@ -94,7 +93,7 @@ def energy_of(folder: Path, models: Mapping[str, str] = MODELS) -> dict[str, Ene
 
 
 def _speeds(folder: Path) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yield speeds [m/s] and accelerations [m/s2] of a run in parts, without empty ones."""
+    """Yield speeds [m/s] and accelerations [m/s2] of a run in parts."""
     try:
         with pq.ParquetFile(folder / TRAJECTORIES) as file:
             names = ["speed_mps", "accel_mps2"]
@@ -105,40 +104,33 @@ def _speeds(folder: Path) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         raise unreadable(folder, TRAJECTORIES, error) from error
 
 
-def _evaluated(
-    program: Path, cycle: Path, models: list[str]
-) -> Iterator[tuple[str, dict[str, float]]]:
-    """Yield each model with its sums over all rows of a driving cycle; the models run side by side.
+def _sums(program: Path, cycle: Path, model: str) -> dict[str, float]:
+    """Return the sums of a model's results over all rows of a driving cycle, in mg/s and Wh/s.
 
     Raises:
-        CommandFailedError: a model does not exist, or its results are not finite.
+        CommandFailedError: the model does not exist, or its results are not finite.
+        OSError: the program cannot be started.
     """
-    with ExitStack() as running:
-        started = [
-            running.enter_context(
-                subprocess.Popen(  # noqa: S603
-                    [
-                        *(str(program), "--timeline-file", str(cycle)),
-                        *("--emission-class", model, "--output", os.devnull),
-                        *("--output.attributes", "fuel"),  # one column takes half the time
-                    ],
-                    stdout=subprocess.PIPE,
-                    stderr=subprocess.PIPE,
-                    text=True,
-                )
-            )
-            for model in models
-        ]
-        for model, process in zip(models, started, strict=True):
-            output, complaint = process.communicate()
-            if process.returncode:
-                reason = " ".join(complaint.split())
-                raise CommandFailedError(f"emission model {model}: {reason}")
-            lines = output.partition(_SUMS)[2].split()
-            pairs = (line.partition(":") for line in lines if ":" in line)
-            sums = {name: float(value) for name, _, value in pairs}
-            wrong = [name for name, value in sums.items() if not math.isfinite(value)]
-            if wrong or not sums:
-                what = ", ".join(wrong) or "the result"
-                raise CommandFailedError(f"emission model {model}: {what} is not finite")
-            yield model, sums
+    command = [str(program), "--timeline-file", str(cycle), "--emission-class", model]
+    # One column of output takes half the time of all.
+    command += ["--output", os.devnull, "--output.attributes", "fuel"]
+    try:
+        done = subprocess.run(  # noqa: S603
+            command, capture_output=True, text=True, check=False, timeout=TIMEOUT_S
+        )
+    except subprocess.TimeoutExpired as error:
+        text = f"emission model {model}: no result after {TIMEOUT_S:g} s"
+        raise CommandFailedError(text) from error
+    if done.returncode:
+        raise CommandFailedError(f"emission model {model}: {' '.join(done.stderr.split())}")
+    lines = done.stdout.partition(_SUMS)[2].split()
+    sums = {
+        name: float(value)
+        for name, colon, value in (line.partition(":") for line in lines)
+        if colon
+    }
+    wrong = [name for name, value in sums.items() if not math.isfinite(value)]
+    if wrong or not sums:
+        what = ", ".join(wrong) or "the result"
+        raise CommandFailedError(f"emission model {model}: {what} is not finite")
+    return sums

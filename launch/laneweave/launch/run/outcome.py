@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import structlog
 from attrs import evolve, frozen
 from rich.console import Console
 from rich.markup import escape
@@ -21,6 +22,8 @@ from laneweave.launch.run_methods import FORMATION, REFERENCE_METHODS
 from laneweave.protocol.errors import BadInputError, CommandFailedError
 from laneweave.protocol.summary import Ending, RunSummary, read_summary, write_summary
 from laneweave.protocol.wire.obstacle_messages import BREAKDOWN
+
+log = structlog.get_logger(__name__)
 
 
 @frozen
@@ -99,10 +102,6 @@ def complete_summary(
         if interrupted:
             raise KeyboardInterrupt
         return Outcome(folder, None, (*problems, "the run wrote no summary"))
-    try:
-        energy = energy_of(folder)
-    except (BadInputError, CommandFailedError) as error:
-        energy, problems = None, (*problems, str(error))
     measured = summary.failover
     if failover is not None:
         measured = evolve(
@@ -115,12 +114,13 @@ def complete_summary(
         runtime=evolve(summary.runtime, processes=processes),
         messages=evolve(summary.messages, dropped_by_faults=dropped),
         failover=measured,
-        energy=energy,
         faults=faults if faults is not None else summary.faults,
         plug_ins=_plug_ins(summary) or None,
     )
     try:
         write_summary(folder, summary)
+        if not interrupted:
+            summary = _with_energy(folder, summary)
     except OSError as error:
         problems = (*problems, f"the summary cannot be written: {error.strerror or error}")
     trips = folder / "trips.parquet"
@@ -133,6 +133,23 @@ def complete_summary(
         text = f"breakdown: only {happened} of {breakdowns} vehicles that fit were on the road"
         problems = (*problems, text)
     return Outcome(folder, summary, (*problems, *violations), interrupted)
+
+
+def _with_energy(folder: Path, summary: RunSummary) -> RunSummary:
+    """Return the summary with the run's energy, and write it; without, if the models fail.
+
+    Raises:
+        OSError: the summary cannot be written.
+    """
+    try:
+        energy = energy_of(folder)
+    except (BadInputError, CommandFailedError, OSError) as error:
+        log.warning("energy and emissions are not known", error=str(error))
+        return summary
+    completed = evolve(summary, energy=energy)
+    if energy is not None:
+        write_summary(folder, completed)
+    return completed
 
 
 def _plug_ins(summary: RunSummary) -> list[str]:

@@ -7,10 +7,11 @@ v and v' are their speeds. Bodies count as rectangles along the road.
     time to collision (TTC)          gap / (v - v') while v > v' (Hayward 1972)
     deceleration rate to avoid a     (v - v')^2 / (2 gap) while v > v' (Almqvist et al. 1991)
     crash (DRAC)
-    post-encroachment time (PET)     from the moment at which a vehicle reaches into a lane until
-                                     the next vehicle behind it in that lane is where its rear was;
-                                     and until it is itself where the rear of the next vehicle ahead
-                                     was (Allen et al. 1978, applied to lane changes)
+    post-encroachment time (PET)     when a vehicle reaches into a lane: (1) the time until the next
+                                     vehicle behind in that lane is where the rear of the entering
+                                     vehicle was; (2) the time until the entering vehicle is where
+                                     the rear of the next vehicle ahead was; 0: they are beside one
+                                     another already (Allen et al. 1978, applied to lane changes)
 """
 
 from __future__ import annotations
@@ -71,6 +72,12 @@ class Rows:
         numbers = codes.indices.to_numpy().astype(np.int64)
         return cls([str(name) for name in codes.dictionary], numbers, *columns)
 
+    def finite(self) -> Rows:
+        """Return the rows whose values are all finite: methods of users may give any."""
+        values = (self.t_s, self.s_m, self.y_m, self.speed_mps, self.accel_mps2)
+        good = np.all([np.isfinite(column) for column in values], axis=0)
+        return Rows(self.names, self.vehicle[good], *(column[good] for column in values))
+
     def joined(self, later: Rows) -> Rows:
         """Return these rows followed by later ones."""
         numbers = {name: number for number, name in enumerate(self.names)}
@@ -105,11 +112,12 @@ class _Distribution:
     def __init__(self, bin_width: float) -> None:
         self._bin_width = bin_width
         self._counts = np.zeros(_BINS, dtype=np.int64)
-        self._sum_of_squares = 0.0
+        self._sum_of_squares = self._max = 0.0
 
     def add(self, values: Floats) -> None:
         """Add absolute values."""
-        numbers = np.minimum(values / self._bin_width, _BINS - 1).astype(np.int64)
+        numbers = np.minimum(np.rint(values / self._bin_width), _BINS - 1).astype(np.int64)
+        self._max = max(self._max, float(values.max(initial=0.0)))
         self._counts += np.bincount(numbers, minlength=_BINS)
         self._sum_of_squares += float(values @ values)
 
@@ -120,16 +128,19 @@ class _Distribution:
         return math.sqrt(self._sum_of_squares / count) if count else math.nan
 
     def percentile(self, percent: float) -> float:
-        """Return a percentile, up to the width of a class; NaN: there are no values."""
+        """Return a percentile, within half the width of a class; NaN: there are no values.
+
+        A percentile in the last class, which is open, is the maximum.
+        """
         total = np.cumsum(self._counts)
         if not total[-1]:
             return math.nan
         number = int(np.searchsorted(total, percent / 100.0 * total[-1]))
-        return self._bin_width * (number + 1)
+        return self._max if number == _BINS - 1 else self._bin_width * number
 
 
 class _Encroachment(NamedTuple):
-    """A place in a lane that one vehicle has left, and that another one will reach."""
+    """A place in a lane where the rear of one vehicle was, and that another one will reach."""
 
     vehicle: str
     """The vehicle that will reach it."""
@@ -138,10 +149,11 @@ class _Encroachment(NamedTuple):
     since_s: float
 
 
-class _Sorted:
-    """Rows with the sizes of their vehicles, by position in each tick, and by vehicle."""
+class _Derived:
+    """Sizes and lanes of rows, and the rows of the same vehicle one tick before and after."""
 
-    def __init__(self, rows: Rows, lane_width_m: float, limits: Sequence[Vehicle]) -> None:
+    def __init__(self, rows: Rows, scenario: Scenario, limits: Sequence[Vehicle]) -> None:
+        lane_width_m, tick_s = scenario.road.lane_width_m, scenario.runtime.tick_s
         vehicle = rows.vehicle
         sizes_m = np.array([one.size_m for one in limits])[vehicle]
         self.length_m, self.half_width_m = sizes_m[:, 0], 0.5 * sizes_m[:, 1]
@@ -157,7 +169,8 @@ class _Sorted:
         self.high_lane = np.floor(high_m / lane_width_m).astype(np.int64)
         order = np.lexsort((self.tick, vehicle))
         follows = vehicle[order[1:]] == vehicle[order[:-1]]
-        follows &= self.tick[order[1:]] == self.tick[order[:-1]] + 1
+        # Ticks without any vehicle have no rows.
+        follows &= np.diff(rows.t_s[order]) < 1.5 * tick_s
         self.before = np.full(len(vehicle), -1)
         """Row of the same vehicle one tick before; -1: there is none."""
         self.before[order[1:][follows]] = order[:-1][follows]
@@ -167,21 +180,23 @@ class _Sorted:
 
 
 class DrivingMeasures:
-    """Collector of safety and comfort; memory does not grow with the length of the run."""
+    """Collector of safety and comfort; stores only what concerns vehicles on the road."""
 
     def __init__(self, scenario: Scenario) -> None:
         """Begin without trajectories."""
+        self._scenario = scenario
         self._tick_s = scenario.runtime.tick_s
-        self._lane_width_m = scenario.road.lane_width_m
-        self._cars = scenario.vehicle
         self._limits: dict[str, Vehicle] = {}
-        """Sizes and limits of vehicles on the road; those of cars are not necessary."""
+        """Sizes and limits of vehicles on the road; missing: those of a car."""
         self._last: Rows | None = None
         """Rows of the last tick."""
         self._open: list[_Encroachment] = []
         self._accels = _Distribution(_ACCEL_BIN_MPS2)
         self._jerks = _Distribution(_JERK_BIN_MPS3)
-        self._hard_brakes = set[str]()
+        self._hard_braking = set[str]()
+        """Vehicles on the road that have braked hard."""
+        self.hard_brakes = 0
+        """Number of vehicles that have braked hard."""
         self._uncomfortable = self._driven = 0
         """Numbers of vehicle ticks."""
         self.emergency_brakes = 0
@@ -194,13 +209,8 @@ class DrivingMeasures:
         """Time that vehicles have spent below each time to collision."""
 
     @property
-    def hard_brakes(self) -> int:
-        """Number of vehicles that have braked hard."""
-        return len(self._hard_brakes)
-
-    @property
     def comfort(self) -> Comfort | None:
-        """Accelerations and jerks so far; None: there were no vehicles."""
+        """Accelerations and jerks so far; None: no vehicle was on the road in successive ticks."""
         if not self._driven:
             return None
         return Comfort(
@@ -212,33 +222,37 @@ class DrivingMeasures:
         )
 
     def enter(self, vehicle: str, limits: Vehicle) -> None:
-        """Note size and limits of a vehicle that enters the road; those who do not are cars."""
+        """Note size and limits of a vehicle; one for which this is not called counts as a car."""
         self._limits[vehicle] = limits
 
     def add(self, rows: Rows) -> None:
-        """Measure the ticks that follow those measured so far."""
+        """Measure the ticks that follow those measured so far; only finite rows count."""
+        rows = rows.finite()
         if not len(rows.t_s):
             return
         known = 0 if self._last is None else len(self._last.t_s)
         if self._last is not None:
             rows = self._last.joined(rows)
-        limits = [self._limits.get(name, self._cars) for name in rows.names]
-        found = _Sorted(rows, self._lane_width_m, limits)
+        limits = [self._limits.get(name, self._scenario.vehicle) for name in rows.names]
+        found = _Derived(rows, self._scenario, limits)
         self._measure_driving(rows, found, known)
         self._measure_gaps(rows, found, known)
         self._measure_encroachments(rows, found, known)
         self._last = rows.since(int(found.ticks[-2]))
         for name in set(rows.names).difference(self._last.names):
             self._limits.pop(name, None)
+            self._hard_braking.discard(name)
 
-    def _measure_driving(self, rows: Rows, found: _Sorted, known: int) -> None:
+    def _measure_driving(self, rows: Rows, found: _Derived, known: int) -> None:
         """Measure accelerations and jerks; the first `known` rows were measured before."""
         accel = rows.accel_mps2[known:]
         self.min_accel_mps2 = min(self.min_accel_mps2, float(accel.min()))
         self.max_accel_mps2 = max(self.max_accel_mps2, float(accel.max()))
         self._accels.add(np.abs(accel))
         hard = known + np.flatnonzero(accel < -HARD_BRAKE_MPS2)
-        self._hard_brakes.update(rows.names[number] for number in np.unique(rows.vehicle[hard]))
+        names = {rows.names[number] for number in np.unique(rows.vehicle[hard])}
+        self.hard_brakes += len(names - self._hard_braking)
+        self._hard_braking |= names
         brakes = rows.accel_mps2 < found.brake_mps2
         before = found.before[known:]
         braked_before = (before >= 0) & brakes[before]
@@ -254,7 +268,7 @@ class DrivingMeasures:
         self._uncomfortable += int(np.count_nonzero(beyond))
         self._driven += len(row)
 
-    def _measure_gaps(self, rows: Rows, found: _Sorted, known: int) -> None:
+    def _measure_gaps(self, rows: Rows, found: _Derived, known: int) -> None:
         """Measure times to collision and decelerations to avoid a crash."""
         behind, ahead = _in_line(rows, found)
         closing_mps = rows.speed_mps[behind] - rows.speed_mps[ahead]
@@ -269,7 +283,7 @@ class DrivingMeasures:
         for limit_s in self.ttc_below_s:
             self.ttc_below_s[limit_s] += self._tick_s * int(np.count_nonzero(ttc_s < limit_s))
 
-    def _measure_encroachments(self, rows: Rows, found: _Sorted, known: int) -> None:
+    def _measure_encroachments(self, rows: Rows, found: _Derived, known: int) -> None:
         """Measure post-encroachment times of lane changes."""
         numbers = {name: number for number, name in enumerate(rows.names)}
         first_rows = dict(zip(rows.vehicle[:known].tolist(), range(known), strict=True))
@@ -288,7 +302,7 @@ class DrivingMeasures:
                 self.min_pet_s = min(self.min_pet_s, reached_s - one.since_s)
 
 
-def _in_line(rows: Rows, found: _Sorted) -> tuple[Ints, Ints]:
+def _in_line(rows: Rows, found: _Derived) -> tuple[Ints, Ints]:
     """Return the rows of vehicles with another one ahead in line, and the rows of those ahead."""
     order = np.lexsort((rows.s_m, found.tick))
     tick, s_m, y_m = found.tick[order], rows.s_m[order], rows.y_m[order]
@@ -312,7 +326,7 @@ def _in_line(rows: Rows, found: _Sorted) -> tuple[Ints, Ints]:
     return behind, ahead
 
 
-def _encroachments(rows: Rows, found: _Sorted, known: int) -> Iterator[tuple[_Encroachment, int]]:
+def _encroachments(rows: Rows, found: _Derived, known: int) -> Iterator[tuple[_Encroachment, int]]:
     """Yield the encroachments of vehicles that reach into another lane, and the row of each.
 
     The row is that of the vehicle which will reach the place, at the time of the encroachment.
@@ -343,18 +357,19 @@ def _encroachments(rows: Rows, found: _Sorted, known: int) -> Iterator[tuple[_En
                 yield _Encroachment(name, lane, float(rears_m.min()), t_s), own
 
 
-def _reached_s(one: _Encroachment, row: int, rows: Rows, found: _Sorted) -> float | None:
+def _reached_s(one: _Encroachment, row: int, rows: Rows, found: _Derived) -> float | None:
     """Return when the vehicle is at the place; infinite: it leaves the lane; None: not yet known.
 
     Args:
         one: the encroachment.
         row: a row of the vehicle before it reaches the place.
         rows: rows.
-        found: their order.
+        found: what follows from them.
     """
     if rows.s_m[row] >= one.at_m:
         return float(rows.t_s[row])  # it is beside the other vehicle already
-    while (later := int(found.after[row])) >= 0:
+    last_s = one.since_s + MAX_PET_S
+    while (later := int(found.after[row])) >= 0 and rows.t_s[row] < last_s:
         if not found.low_lane[later] <= one.lane <= found.high_lane[later]:
             return math.inf
         if rows.s_m[later] >= one.at_m:

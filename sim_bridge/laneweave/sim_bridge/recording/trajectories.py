@@ -147,7 +147,7 @@ class Trajectories:
         )
 
     def comfort(self) -> Comfort | None:
-        """Return accelerations and jerks so far; None: there were no vehicles."""
+        """Return accelerations and jerks so far; None: nothing was measured."""
         self._measure()
         return self._measures.comfort
 
@@ -166,8 +166,8 @@ class Trajectories:
         if rows:
             vehicles, s_m, y_m, speed_mps, _, accel_mps2, *_ = zip(*rows, strict=True)
             columns = (self._times[self._measured_rows :], s_m, y_m, speed_mps, accel_mps2)
-            self._measures.add(Rows.of(pa.array(vehicles), *map(np.array, columns)))
             self._measured_rows = len(self._rows)
+            self._measures.add(Rows.of(pa.array(vehicles), *map(np.array, columns)))
 
     def _write_rows(self, *, provisional: bool = False) -> None:
         """Measure the buffered rows, and write them as one row group."""

@@ -6,6 +6,9 @@ import csv
 import gzip
 import json
 import math
+import resource
+import shutil
+import signal
 import struct
 import subprocess
 import sys
@@ -177,8 +180,11 @@ def test_mcap_is_read_by_its_own_reader(
         assert cube.pose.position.x == pytest.approx(row["s_m"] - 0.5 * cube.size.x, abs=0.1)
         assert cube.pose.position.y == pytest.approx(row["y_m"], abs=1e-3)
     assert {cube.size.x for cube in cubes} == {5.0, 12.0}
-    assert 0 < len(messages) <= len(events)
-    assert any(json.loads(message)["kind"] == "entered" for message in messages)
+    assert sorted(json.loads(message)["kind"] for message in messages) == sorted(
+        json.loads(event)["kind"] for event in events
+    )
+    front_y_m = Recording.read(run).front_y_m
+    assert [point[1] for point in points] == pytest.approx(front_y_m.tolist(), abs=1e-3)
 
 
 def test_commonroad_finds_no_collision_and_a_planted_one(run: Path, tmp_path: Path) -> None:
@@ -225,8 +231,15 @@ def test_a_part_of_a_run(run: Path, rows: list[dict[str, Any]], tmp_path: Path) 
     with (tmp_path / "trajectories.csv").open(encoding="utf-8") as file:
         times_s = [float(one["t_s"]) for one in csv.DictReader(file)]
     assert len(times_s) == sum(10.0 <= row["t_s"] <= 12.0 for row in rows) > 0
-    with pytest.raises(BadInputError, match="--from, --to: got '500 to the end'"):
-        export(run, Format.fcd, tmp_path / "x.xml", 500.0)
+    for chosen, name in ((Format.fcd, "x.xml"), (Format.csv, "x")):
+        with pytest.raises(BadInputError, match="--from, --to: got '500 to the end'"):
+            export(run, chosen, tmp_path / name, 500.0)
+        with pytest.raises(BadInputError, match="--from: got '12'; allowed: at most --to = 10"):
+            export(run, chosen, tmp_path / name, 12.0, 10.0)
+        with pytest.raises(BadInputError, match="--to: got nan"):
+            export(run, chosen, tmp_path / name, None, math.nan)
+    with pytest.raises(BadInputError, match="at least two ticks"):
+        export(run, Format.commonroad, tmp_path / "x.xml", 12.0, 12.0)
     assert not (tmp_path / "x.xml").exists()
 
 
@@ -252,9 +265,56 @@ def test_what_is_not_a_run_is_refused(tmp_path: Path) -> None:
 
 def test_a_folder_that_cannot_be_written(run: Path, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    for chosen, name in ((Format.csv, "file"), (Format.fcd, "file/x.xml")):
+    for chosen, name in ((Format.csv, "file/x"), (Format.fcd, "file/x.xml")):
         with pytest.raises(CommandFailedError, match="file"):
             export(run, chosen, tmp_path / name)
+    for name in ("file", "tables.csv"):
+        with pytest.raises(BadInputError, match=r"--out: .* allowed: a folder"):
+            export(run, Format.csv, tmp_path / name)
+    with pytest.raises(BadInputError, match="other than road"):
+        export(run, Format.fcd, tmp_path / "road.net.xml")
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+@pytest.mark.parametrize("chosen", Format)
+def test_on_a_full_disk_the_command_fails_in_one_line(
+    run: Path, chosen: Format, tmp_path: Path
+) -> None:
+    """A limit on the size of files stands for the disk; nothing is left of what did not fit."""
+    out = {"csv": ".", "fcd": "x.xml", "mcap": "x.mcap", "commonroad": "x.xml"}[chosen]
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, before[1]))
+    try:
+        with pytest.raises(CommandFailedError):
+            export(run, chosen, tmp_path / out)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        signal.signal(signal.SIGXFSZ, handler)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "chosen"),
+    [
+        ("trips.parquet", "cut", Format.fcd),
+        ("trips.parquet", "cut", Format.csv),
+        ("trajectories.parquet", "cut", Format.mcap),
+        ("events.jsonl", '{"t_s": 3.0, "ki', Format.mcap),
+        ("events.jsonl", "[]", Format.mcap),
+    ],
+)
+def test_damaged_runs_are_refused(
+    run: Path, tmp_path: Path, file: str, content: str, chosen: Format
+) -> None:
+    shutil.copytree(run, tmp_path / "run")
+    whole = (run / file).read_bytes()
+    cut = whole[:200] + bytes(200) + whole[400:]
+    (tmp_path / "run" / file).write_bytes(cut if content == "cut" else content.encode())
+    with pytest.raises(BadInputError):
+        export(tmp_path / "run", chosen)
+    exported = tmp_path / "run" / "export"
+    assert not exported.exists() or not list(exported.iterdir())
 
 
 def test_the_command_prints_its_files(

@@ -12,8 +12,10 @@ from rich.console import Console
 from laneweave.launch.cli.corridor_command import corridor_tables
 from laneweave.launch.faults.failover import Failover
 from laneweave.launch.report.summary_table import summary_rows
+from laneweave.launch.run import outcome as outcome_module
 from laneweave.launch.run.outcome import Outcome, complete_summary, print_outcome
 from laneweave.protocol.config.scenario_files import load_scenario, parse_scenario
+from laneweave.protocol.errors import BadInputError, CommandFailedError
 from laneweave.protocol.summary import RunSummary, write_summary
 from laneweave.sim_bridge.corridors.sumo_corridor import read_corridor
 from laneweave.sim_bridge.corridors.sumo_simulation import WHOLE
@@ -137,6 +139,22 @@ def test_a_signal_after_the_end_interrupts_nothing(tmp_path: Path) -> None:
 def test_a_run_that_was_interrupted_before_it_began_has_no_outcome(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         complete_summary(tmp_path, problems=(), interrupted=True)
+
+
+@pytest.mark.parametrize(
+    "error", [OSError("no space"), BadInputError("DIR", "x", "y"), CommandFailedError("no model")]
+)
+def test_without_energy_the_rest_of_the_summary_is_complete(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
+    def fail(_: Path) -> None:
+        raise error
+
+    monkeypatch.setattr(outcome_module, "energy_of", fail)
+    outcome = judge(tmp_path, summary(), dropped=3)
+    assert (outcome.exit_status, outcome.problems) == (0, ())
+    written = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))
+    assert (written["runtime"]["processes"], "energy" in written) == (9, False)
 
 
 def test_a_run_without_a_summary_failed(tmp_path: Path) -> None:
