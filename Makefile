@@ -62,10 +62,10 @@ test-full: $(STAMP) ## run all tests, including the long ones
 containers: $(STAMP) ## build the images of compose.yaml and run the deployment in containers (needs podman or docker)
 	$(BIN)/pytest -m full tests/system/test_containers.py
 
-evaluation: $(STAMP) ## run the evaluation and write the tables of docs/EVALUATION.md (BUDGET=90 minutes on 2 cores)
+evaluation: $(STAMP) ## run the evaluation and write the tables of docs/EVALUATION_*.md (BUDGET=90 minutes on 2 cores)
 	$(BIN)/python benchmarks/evaluate.py --budget $(BUDGET)
 
-evaluation-faults: $(STAMP) ## run the experiments of "Under faults" in docs/EVALUATION.md (an hour and a half)
+evaluation-faults: $(STAMP) ## run the experiments of "Under faults" in docs/EVALUATION_FAULTS.md (an hour and a half)
 	$(BIN)/python benchmarks/evaluate.py --only faults
 
 docs: $(STAMP) ## update the generated parts of the documents

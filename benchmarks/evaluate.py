@@ -1,4 +1,4 @@
-"""Run the evaluation and update docs/EVALUATION.md.
+"""Run the evaluation and update its pages, docs/EVALUATION_*.md.
 
     python benchmarks/evaluate.py [--only PART ...] [--labels LABEL ...] [--seeds A:B]
                 [--budget MINUTES] [--jobs N] [--duration S] [--sweeps DIR ...] [--out DIR]
@@ -8,7 +8,7 @@ speed      real-time factors of three deployments
 length     cost of a vehicle on 1 km and on 10 km of road
 stability  how a disturbance of speed propagates: benchmarks/stability.py
 sweep      every method at every volume, one seed after the other
-report     docs/evidence/evaluation.json, figures in docs/images, tables in docs/EVALUATION.md
+report     docs/evidence/evaluation.json, figures in docs/images, tables in the pages
 faults     benchmarks/resilience.py, over an hour; only on request
 
 Finished parts are kept: the same command continues where it stopped. With --labels the sweep runs

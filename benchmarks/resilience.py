@@ -1,4 +1,4 @@
-"""Cost of faults: the table of docs/EVALUATION.md, "Under faults".
+"""Cost of faults: the table of docs/EVALUATION_FAULTS.md, "Under faults".
 
     python benchmarks/resilience.py [--only NAME ...] [--out FOLDER]
 

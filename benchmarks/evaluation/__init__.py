@@ -1,8 +1,10 @@
-"""The evaluation: from finished runs to the tables and figures of docs/EVALUATION.md.
+"""The evaluation: from finished runs to the tables and figures of docs/EVALUATION_*.md.
 
 programme        methods and volumes; goals
 lattice_points   distances between vehicles at the fixed time points of the lattice
-points           results of each label and volume over its seeds
+points           results of each run, and of each label and volume over its seeds
+intervals, comparisons
+                 confidence intervals; formation control against each reference method
 trials           single runs: over Zenoh (and their agreement with simulated ones), for
                  real-time factors, on a long road
 evidence         the JSON file of all results

@@ -14,7 +14,7 @@ from attrs import frozen
 
 from evaluation.evidence import Evidence, read_evidence, setting_of, write_evidence
 from evaluation.pictures import draw_pictures
-from evaluation.points import point_rows
+from evaluation.points import run_rows
 from evaluation.programme import FORMATIONS, points_of
 from evaluation.trials import (
     TRIALS,
@@ -124,7 +124,7 @@ def collect(out: Path, sweeps: Iterable[Path], labels: Collection[str], images: 
     Args:
         out: the evaluation's folder.
         sweeps: folders of other sweeps; empty: the sweep in `out`, if there is one.
-        labels: labels of the points; figures show all runs.
+        labels: labels of the rows; figures show all runs.
         images: folder of the figures; figures that are not drawn again are removed.
 
     Raises:
@@ -143,14 +143,14 @@ def collect(out: Path, sweeps: Iterable[Path], labels: Collection[str], images: 
     if not folders:
         return evidence
     runs = list(runs_of(folders))
-    points = [row for row in point_rows(runs) if row.label in labels]
+    rows = [row for row in run_rows(runs) if row.label in labels]
     pictures = draw_pictures(runs, images)
     names = {picture.name for picture in pictures}
     for path in images.glob(PICTURES):
         if path.name not in names:
             path.unlink()
     return evidence.updated_with(
-        Evidence(setting=setting_of(runs), points=tuple(points), pictures=pictures)
+        Evidence(setting=setting_of(runs), runs=tuple(rows), pictures=pictures)
     )
 
 

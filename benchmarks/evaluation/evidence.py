@@ -4,20 +4,22 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import Final
 
-from attrs import asdict, evolve, frozen
+from attrs import asdict, evolve, fields, frozen
 
-from evaluation.points import Key, PointRow
+from evaluation.points import Key, PointRow, RunRow, points_of_runs
 from evaluation.programme import FORMATIONS
 from evaluation.trials import AgreementRow, CostRow, FactorRow
 from laneweave.launch.recordings.runs import Run
+from laneweave.launch.run_methods import rank
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.files import write_atomically
 from laneweave.protocol.structuring import structure
 
-SCHEMA: Final = "laneweave.evaluation/1"
+SCHEMA: Final = "laneweave.evaluation/2"
 
 
 @frozen
@@ -53,11 +55,16 @@ class Evidence:
 
     schema: str = SCHEMA
     setting: Setting | None = None
-    points: tuple[PointRow, ...] = ()
+    runs: tuple[RunRow, ...] = ()
     pictures: tuple[Picture, ...] = ()
     agreements: tuple[AgreementRow, ...] = ()
     factors: tuple[FactorRow, ...] = ()
     costs: tuple[CostRow, ...] = ()
+
+    @cached_property
+    def points(self) -> tuple[PointRow, ...]:
+        """The runs by label and volume, over their seeds."""
+        return points_of_runs(self.runs)
 
     @property
     def by_key(self) -> dict[Key, PointRow]:
@@ -67,21 +74,20 @@ class Evidence:
     def updated_with(self, new: Evidence) -> Evidence:
         """Return a copy in which the parts of newer evidence replace the present ones.
 
-        Points replace those of the same labels.
+        Runs replace those of the same labels.
 
         Raises:
-            BadInputError: points of other labels have another setting.
+            BadInputError: runs of other labels have another setting.
         """
         kept = self
-        if new.points:
-            labels = {row.label for row in new.points}
-            others = tuple(row for row in self.points if row.label not in labels)
+        if new.runs:
+            labels = {row.label for row in new.runs}
+            others = [row for row in self.runs if row.label not in labels]
             if others and new.setting != self.setting:
                 names = ", ".join(sorted({row.label for row in others}))
                 raise BadInputError("setting", new.setting, f"{self.setting}, as for {names}")
-            kept = evolve(
-                kept, setting=new.setting, points=(*others, *new.points), pictures=new.pictures
-            )
+            runs = sorted([*others, *new.runs], key=lambda row: (*rank(row.label), *row.key[1:]))
+            kept = evolve(kept, setting=new.setting, runs=tuple(runs), pictures=new.pictures)
         return evolve(
             kept,
             agreements=new.agreements or kept.agreements,
@@ -114,10 +120,19 @@ def read_evidence(path: Path) -> Evidence:
     """
     if not path.is_file():
         return Evidence()
-    return structure(json.loads(path.read_text(encoding="utf-8")), Evidence)
+    found = json.loads(path.read_text(encoding="utf-8"))
+    if found.get("schema") != SCHEMA:
+        raise BadInputError(f"{path}: schema", found.get("schema"), SCHEMA)
+    names = found.pop("columns", [])
+    rows = [dict(zip(names, row, strict=True)) for row in found["runs"]]
+    return structure(found | {"runs": rows}, Evidence)
 
 
 def write_evidence(evidence: Evidence, path: Path) -> None:
-    """Write the evidence atomically."""
-    text = json.dumps(asdict(evidence), indent=1)
-    write_atomically(path, text + "\n")
+    """Write the evidence atomically, with one line for each run."""
+    found = asdict(evidence)
+    runs = found.pop("runs")
+    names = [own.name for own in fields(RunRow)]
+    lines = ",\n".join(json.dumps([run[name] for name in names]) for run in runs)
+    head = json.dumps(found | {"columns": names}, indent=1).removesuffix("\n}")
+    write_atomically(path, f'{head},\n "runs": [\n{lines}\n ]\n}}\n')

@@ -40,30 +40,33 @@ def _requirements(goal: Goal) -> Iterator[str]:
 
 def meets(row: PointRow, goal: Goal) -> bool:
     """Return whether a point meets a goal for its label and volume."""
+    travel_s, demanded = row.mean("travel_s"), row.total("demanded")
     kept = [
-        row.travel_s is not None and row.travel_s <= goal.travel_s,
-        100.0 * row.on_preferred_lane >= goal.on_lane_percent * row.demanded > 0.0,
+        travel_s is not None and travel_s <= goal.travel_s,
+        100.0 * row.total("on_preferred_lane") >= goal.on_lane_percent * demanded > 0.0,
     ]
     if goal.accel_mps2 is not None:
         # Rounded as in the tables.
-        found = (row.min_accel_mps2, row.max_accel_mps2)
+        found = (row.lowest("min_accel_mps2"), row.highest("max_accel_mps2"))
         kept += [a is not None and round(abs(a), 2) <= goal.accel_mps2 for a in found]
     if goal.fallback_percent is not None:
-        kept.append(100.0 * row.fallbacks <= goal.fallback_percent * row.plans)
+        fallbacks, plans = row.total("fallbacks"), row.total("plans")
+        kept.append(100.0 * fallbacks <= goal.fallback_percent * plans)
     return all(kept)
 
 
 def _measured(row: PointRow, goal: Goal) -> str:
-    off = row.demanded - row.on_preferred_lane
+    demanded = row.total("demanded")
+    off = demanded - row.total("on_preferred_lane")
     parts = [
-        f"{number(row.travel_s, 2)} s",
-        f"{off} of {row.demanded:,} not in their lane" if off else "100 %",
+        f"{number(row.mean('travel_s'), 2)} s",
+        f"{off} of {demanded:,} not in their lane" if off else "100 %",
     ]
     if goal.accel_mps2 is not None:
-        low, high = number(row.min_accel_mps2, 2), number(row.max_accel_mps2, 2)
-        parts.append(f"{low} to {high} m/s2")
+        low, high = row.lowest("min_accel_mps2"), row.highest("max_accel_mps2")
+        parts.append(f"{number(low, 2)} to {number(high, 2)} m/s2")
     if goal.fallback_percent is not None:
-        parts.append(f"{row.fallbacks} of {row.plans:,} plans")
+        parts.append(f"{row.total('fallbacks')} of {row.total('plans'):,} plans")
     few = "" if len(row.seeds) >= len(SEEDS) else f" ({len(row.seeds)} of {len(SEEDS)} seeds)"
     return ", ".join(parts) + few
 
@@ -73,11 +76,11 @@ def _safety(evidence: Evidence) -> Iterator[tuple[str, ...]]:
     rows = [row for row in evidence.points if row.label in FORMATIONS and row.seeds]
     runs = f"{sum(len(row.seeds) for row in rows)} runs of formation control"
     yield _row(
-        "overlaps", "none", f"{sum(row.overlaps for row in rows)} in {runs}",
-        [not row.overlaps for row in rows],
+        "overlaps", "none", f"{sum(row.total('overlaps') for row in rows)} in {runs}",
+        [not row.total("overlaps") for row in rows],
     )  # fmt: skip
-    low = min((row.min_accel_mps2 for row in rows if row.min_accel_mps2 is not None), default=None)
-    high = max((row.max_accel_mps2 for row in rows if row.max_accel_mps2 is not None), default=None)
+    low = min((one for row in rows for one in row.values("min_accel_mps2")), default=None)
+    high = max((one for row in rows for one in row.values("max_accel_mps2")), default=None)
     setting = evidence.setting
     limits = (
         f"{setting.min_accel_mps2:g} to {setting.max_accel_mps2:g} m/s2" if setting else "limits"

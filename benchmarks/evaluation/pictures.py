@@ -1,4 +1,4 @@
-"""The figures of docs/EVALUATION.md, from the runs of a sweep."""
+"""The figures of docs/EVALUATION_PAPERS_ROAD.md, from the runs of a sweep."""
 
 from __future__ import annotations
 

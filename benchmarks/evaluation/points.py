@@ -1,20 +1,22 @@
-"""Results of each label and volume over the seeds of a sweep."""
+"""Results of each run of a sweep, and of each label and volume over its seeds."""
 
 from __future__ import annotations
 
+import statistics
 from collections.abc import Iterable, Sequence
 from typing import Final
 
 import numpy as np
 from attrs import frozen
 
+from evaluation.intervals import Interval, interval
 from evaluation.lattice_points import lattice_spacing
 from laneweave.launch.recordings.formations import read_events
-from laneweave.launch.recordings.results_over_seeds import results_table
 from laneweave.launch.recordings.runs import Run
 from laneweave.launch.recordings.trajectories import Tracks, read_tracks
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.summary import Ending
 from laneweave.protocol.wire.events import PLAN_MADE, STREAM_PLANNED
 from laneweave.sim_bridge.recording.trips import WARM_UP_S
 
@@ -23,6 +25,8 @@ SLOW_SHARE: Final = 0.5
 """Traffic is congested where its mean speed is below this share of v_F."""
 LIMIT_ERROR: Final = 0.001
 """Rounding error of summaries."""
+CO2_OF: Final = "petrol"
+"""Type of car whose emissions are compared."""
 SOLVER: Final = {PLAN_MADE: "branching", STREAM_PLANNED: "rolling"}
 """The solver of plans whose events do not name it, by kind of event."""
 Key = tuple[str, float]
@@ -49,65 +53,178 @@ class Traced:
 
 @frozen
 class PlanningTimes:
-    """Planning times of a solver, over the plans of all seeds."""
+    """Planning times of a solver."""
 
     solver: str
     plans: int
     p50_ms: float
+    """Over several runs: the median of their medians."""
     p95_ms: float
+    """Over several runs: the highest, like the maximum."""
     max_ms: float
 
 
 @frozen
-class PointRow:
-    """Results of a label at a volume over all complete runs; None: unknown."""
+class RunRow:
+    """Results of a run; None: unknown."""
 
     label: str
     volume_veh_per_lane_h: float
-    seeds: tuple[int, ...]
-    """Seeds of the complete runs, in which all vehicles have left."""
-    failed: tuple[tuple[int, str], ...]
-    """(seed, reason) of failed runs; complete runs with overlaps are included in the figures."""
-    demanded: int
-    left: int
-    on_preferred_lane: int
-    travel_s: float | None
-    """Mean over the seeds of the mean travel time from the demanded arrival."""
-    travel_sd_s: float | None
-    """Standard deviation of the seeds' mean travel times."""
-    travel_p95_s: float | None
-    """Mean over the seeds of the 95th percentile."""
-    throughput_veh_per_lane_h: float | None
-    """Mean over the seeds."""
-    overlaps: int
-    """Pairs of bodies, over all seeds."""
-    emergency_brakes: int
-    """Over all seeds."""
-    min_gap_m: float | None
-    min_headway_s: float | None
-    min_accel_mps2: float | None
-    max_accel_mps2: float | None
-    within_limits: bool
+    seed: int
+    reason: str
+    """Why the run failed; empty: it did not."""
+    complete: bool
+    """Whether all vehicles have left; other runs are in no figure."""
+    demanded: int = 0
+    left: int = 0
+    on_preferred_lane: int = 0
+    travel_s: float | None = None
+    """Mean travel time from the demanded arrival."""
+    travel_p95_s: float | None = None
+    throughput_veh_per_lane_h: float | None = None
+    overlaps: int = 0
+    """Pairs of bodies."""
+    emergency_brakes: int = 0
+    hard_brakes: int | None = None
+    """Vehicles."""
+    min_gap_m: float | None = None
+    min_headway_s: float | None = None
+    min_accel_mps2: float | None = None
+    max_accel_mps2: float | None = None
+    within_limits: bool = True
     """Whether all accelerations are within the vehicles' limits."""
-    largest_formation: int
-    planning_p95_ms: float | None
-    """Worst over the seeds."""
-    traced: Traced | None
-    """Figures from trajectories; None: no trajectories were stored."""
+    min_ttc_s: float | None = None
+    ttc_below_3_s: float | None = None
+    min_pet_s: float | None = None
+    uncomfortable_percent: float | None = None
+    co2_g_per_km: float | None = None
     plans: int = 0
-    """Over all seeds, like the following fields."""
     fallbacks: int = 0
     """Plans of the fallback planner."""
+    planning_p95_ms: float | None = None
     planning: tuple[PlanningTimes, ...] = ()
+    traced: Traced | None = None
+    """Figures from trajectories; None: no trajectories were stored."""
+
+    @property
+    def key(self) -> Key:
+        """Label and volume."""
+        return self.label, self.volume_veh_per_lane_h
+
+
+@frozen
+class PointRow:
+    """Results of a label at a volume over its complete runs; None: unknown."""
+
+    label: str
+    volume_veh_per_lane_h: float
+    runs: tuple[RunRow, ...]
+    """All runs, in the order of seeds."""
+
+    @property
+    def complete(self) -> tuple[RunRow, ...]:
+        """The complete runs, in which all vehicles have left; those with overlaps are included."""
+        return tuple(run for run in self.runs if run.complete)
+
+    @property
+    def seeds(self) -> tuple[int, ...]:
+        """Seeds of the complete runs."""
+        return tuple(run.seed for run in self.complete)
+
+    @property
+    def failed(self) -> tuple[RunRow, ...]:
+        """The failed runs."""
+        return tuple(run for run in self.runs if run.reason)
+
+    def values(self, name: str) -> list[float]:
+        """Return the known values of a figure, run by run."""
+        found = (getattr(run, name) for run in self.complete)
+        return [float(value) for value in found if value is not None]
+
+    def total(self, name: str) -> int:
+        """Return the sum of a count over the runs."""
+        return int(sum(self.values(name)))
+
+    def mean(self, name: str) -> float | None:
+        """Return the mean of a figure over the runs."""
+        values = self.values(name)
+        return round(float(np.mean(values)), 3) if values else None
+
+    def lowest(self, name: str) -> float | None:
+        """Return the minimum of a figure over the runs."""
+        return min(self.values(name), default=None)
+
+    def highest(self, name: str) -> float | None:
+        """Return the maximum of a figure over the runs."""
+        return max(self.values(name), default=None)
+
+    def interval(self, name: str) -> Interval | None:
+        """Return the confidence interval of a figure's mean; None: there are too few runs."""
+        return interval(self.values(name))
 
     @property
     def on_lane_percent(self) -> float | None:
         """Share of vehicles that left in their preferred lane, among all that left."""
-        return 100.0 * self.on_preferred_lane / self.left if self.left else None
+        left = self.total("left")
+        return 100.0 * self.total("on_preferred_lane") / left if left else None
+
+    @property
+    def within_limits(self) -> bool:
+        """Whether all accelerations are within the vehicles' limits."""
+        return all(run.within_limits for run in self.complete)
+
+    @property
+    def planning(self) -> tuple[PlanningTimes, ...]:
+        """Planning times of each solver."""
+        found: dict[str, list[PlanningTimes]] = {}
+        for run in self.complete:
+            for one in run.planning:
+                found.setdefault(one.solver, []).append(one)
+        return tuple(
+            PlanningTimes(
+                solver,
+                sum(one.plans for one in times),
+                round(statistics.median(one.p50_ms for one in times), 2),
+                max(one.p95_ms for one in times),
+                max(one.max_ms for one in times),
+            )
+            for solver, times in sorted(found.items())
+        )
+
+    @property
+    def traced(self) -> Traced | None:
+        """Figures from the trajectories of all runs; None: none were stored."""
+        found = [run.traced for run in self.complete if run.traced is not None]
+        if not found:
+            return None
+        spacings = [one.lattice_least_m for one in found if one.lattice_least_m is not None]
+        offs = [one.lattice_worst_off_m for one in found if one.lattice_worst_off_m is not None]
+        slow = [one.slow_m for one in found if one.slow_m is not None]
+        speeds = [one.slowest_mps for one in found if one.slowest_mps is not None]
+        return Traced(
+            runs=len(found),
+            lattice_least_m=min(spacings, default=None),
+            lattice_pairs=sum(one.lattice_pairs for one in found),
+            lattice_worst_off_m=max(offs, default=None),
+            lattice_kept=all(one.lattice_kept for one in found),
+            slow_m=(min(m for m, _ in slow), max(m for _, m in slow)) if slow else None,
+            slowest_mps=min(speeds, default=None),
+        )
 
 
-def point_rows(runs: Iterable[Run]) -> list[PointRow]:
-    """Return the rows of all labels and volumes, in the order of labels.
+def points_of_runs(rows: Iterable[RunRow]) -> tuple[PointRow, ...]:
+    """Return the points of runs, in the order in which they appear."""
+    groups: dict[Key, list[RunRow]] = {}
+    for row in rows:
+        groups.setdefault(row.key, []).append(row)
+    return tuple(
+        PointRow(*key, tuple(sorted(group, key=lambda row: row.seed)))
+        for key, group in groups.items()
+    )
+
+
+def run_rows(runs: Iterable[Run]) -> list[RunRow]:
+    """Return the rows of runs, in the order of labels, volumes and seeds.
 
     Raises:
         BadInputError: runs differ in road or demand, or one occurs twice.
@@ -115,10 +232,7 @@ def point_rows(runs: Iterable[Run]) -> list[PointRow]:
     """
     listed = sorted(runs, key=lambda run: run.order)
     check_comparable(listed)
-    groups: dict[Key, list[Run]] = {}
-    for run in listed:
-        groups.setdefault((run.label, run.volume_veh_per_lane_h), []).append(run)
-    return [_row(key, group) for key, group in groups.items()]
+    return [_row(run) for run in listed]
 
 
 def check_comparable(runs: Sequence[Run]) -> None:
@@ -144,58 +258,59 @@ def check_comparable(runs: Sequence[Run]) -> None:
         seen.add(key)
 
 
-def _row(key: Key, runs: Sequence[Run]) -> PointRow:
-    complete = [run for run in runs if run.summary and run.summary.ending == "complete"]
-    scenario, results = runs[0].scenario, results_table(complete)
-
-    def values(column: str) -> list[float]:
-        found = results[column].to_pylist() if column in results.column_names else []
-        return [float(value) for value in found if value is not None]
-
-    times_s = values("travel_time_s_mean")
-    low = min(values("safety_min_accel_mps2"), default=None)
-    high = max(values("safety_max_accel_mps2"), default=None)
-    return PointRow(
-        label=key[0],
-        volume_veh_per_lane_h=key[1],
-        seeds=tuple(run.scenario.seed for run in complete),
-        failed=tuple((run.scenario.seed, run.reason) for run in runs if run.reason),
-        demanded=int(sum(values("vehicles_demanded"))),
-        left=int(sum(values("vehicles_left"))),
-        on_preferred_lane=int(sum(values("vehicles_on_preferred_lane"))),
-        travel_s=_mean(times_s),
-        travel_sd_s=round(float(np.std(times_s, ddof=1)), 3) if len(times_s) > 1 else None,
-        travel_p95_s=_mean(values("travel_time_s_p95")),
-        throughput_veh_per_lane_h=_mean(values("throughput_veh_per_lane_h")),
-        overlaps=int(sum(values("safety_overlaps"))),
-        emergency_brakes=int(sum(values("safety_emergency_brakes"))),
-        min_gap_m=min(values("safety_min_gap_m"), default=None),
-        min_headway_s=min(values("safety_min_headway_s"), default=None),
+def _row(run: Run) -> RunRow:
+    label, volume, seed = run.label, run.volume_veh_per_lane_h, run.scenario.seed
+    found = run.summary
+    if found is None or found.ending != Ending.COMPLETE.value:
+        return RunRow(label, volume, seed, run.reason, complete=False)
+    vehicles, safety, planning = found.vehicles, found.safety, found.planning
+    energy = (found.energy or {}).get(CO2_OF)
+    low, high = safety.min_accel_mps2, safety.max_accel_mps2
+    return RunRow(
+        label,
+        volume,
+        seed,
+        run.reason,
+        complete=True,
+        demanded=vehicles.demanded,
+        left=vehicles.left,
+        on_preferred_lane=vehicles.on_preferred_lane,
+        travel_s=found.travel_time_s.mean,
+        travel_p95_s=found.travel_time_s.p95,
+        throughput_veh_per_lane_h=found.throughput_veh_per_lane_h,
+        overlaps=safety.overlaps,
+        emergency_brakes=safety.emergency_brakes,
+        hard_brakes=safety.hard_brakes,
+        min_gap_m=safety.min_gap_m,
+        min_headway_s=safety.min_headway_s,
         min_accel_mps2=low,
         max_accel_mps2=high,
-        within_limits=within_limits(low, high, scenario),
-        largest_formation=int(max(values("planning_largest_formation"), default=0)),
-        planning_p95_ms=max(values("planning_solve_ms_p95"), default=None),
-        traced=_traced([run for run in complete if run.has_trajectories]),
-        plans=int(sum(values("planning_plans"))),
-        fallbacks=int(sum(values("planning_fallbacks"))),
-        planning=planning_times(complete),
+        within_limits=within_limits(low, high, run.scenario),
+        min_ttc_s=safety.min_ttc_s,
+        ttc_below_3_s=safety.ttc_below_3_s,
+        min_pet_s=safety.min_pet_s,
+        uncomfortable_percent=found.comfort.uncomfortable_percent if found.comfort else None,
+        co2_g_per_km=energy.co2_g_per_km if energy else None,
+        plans=planning.plans,
+        fallbacks=planning.fallbacks or 0,
+        planning_p95_ms=planning.solve_ms.p95,
+        planning=planning_times(run),
+        traced=trace(read_tracks(run.folder), run.scenario) if run.has_trajectories else None,
     )
 
 
-def planning_times(runs: Iterable[Run]) -> tuple[PlanningTimes, ...]:
-    """Return the planning times of each solver, read from the events of runs.
+def planning_times(run: Run) -> tuple[PlanningTimes, ...]:
+    """Return the planning times of each solver, read from the events of a run.
 
     Raises:
         OSError, ValueError, TypeError: events cannot be read.
     """
     found: dict[str, list[float]] = {}
-    for run in runs:
-        for event in read_events(run.folder, *SOLVER):
-            solve_ms = event.get("solve_ms")
-            if event.get("role") == "coordinator" and isinstance(solve_ms, (int, float)):
-                solver = str(event.get("solver") or SOLVER[event["kind"]])
-                found.setdefault(solver, []).append(float(solve_ms))
+    for event in read_events(run.folder, *SOLVER):
+        solve_ms = event.get("solve_ms")
+        if event.get("role") == "coordinator" and isinstance(solve_ms, (int, float)):
+            solver = str(event.get("solver") or SOLVER[event["kind"]])
+            found.setdefault(solver, []).append(float(solve_ms))
     return tuple(
         PlanningTimes(
             solver,
@@ -217,26 +332,6 @@ def within_limits(low: float | None, high: float | None, scenario: Scenario) -> 
     vehicle = scenario.vehicle
     return (low is None or low >= vehicle.min_accel_mps2 - LIMIT_ERROR) and (
         high is None or high <= vehicle.max_accel_mps2 + LIMIT_ERROR
-    )
-
-
-def _traced(runs: Sequence[Run]) -> Traced | None:
-    """Return the combined figures of the trajectories of several runs."""
-    found = [trace(read_tracks(run.folder), run.scenario) for run in runs]
-    if not found:
-        return None
-    spacings = [one.lattice_least_m for one in found if one.lattice_least_m is not None]
-    offs = [one.lattice_worst_off_m for one in found if one.lattice_worst_off_m is not None]
-    slow = [one.slow_m for one in found if one.slow_m is not None]
-    speeds = [one.slowest_mps for one in found]
-    return Traced(
-        runs=len(found),
-        lattice_least_m=min(spacings, default=None),
-        lattice_pairs=sum(one.lattice_pairs for one in found),
-        lattice_worst_off_m=max(offs, default=None),
-        lattice_kept=all(one.lattice_kept for one in found),
-        slow_m=(min(one[0] for one in slow), max(one[1] for one in slow)) if slow else None,
-        slowest_mps=min((mps for mps in speeds if mps is not None), default=None),
     )
 
 
@@ -279,7 +374,3 @@ def slow_stretch(
     slow = driven[mean_mps < SLOW_SHARE * scenario.formation.speed_mps]
     stretch = (float(edges_m[slow[0]]), float(edges_m[slow[-1] + 1])) if len(slow) else None
     return stretch, round(float(mean_mps.min()), 2)
-
-
-def _mean(values: Sequence[float]) -> float | None:
-    return round(float(np.mean(values)), 3) if values else None

@@ -83,7 +83,7 @@ class _Judge:
 
     def _travel_s(self, label: str, volume: float) -> float | None:
         row = self._row(label, volume)
-        return None if row is None else row.travel_s
+        return None if row is None else row.mean("travel_s")
 
     def _stable(self) -> Statement:
         text = "The travel time of formation control stays stable from 1000 to 1600 veh/(lane h)"
@@ -115,9 +115,9 @@ class _Judge:
         """Return the lowest congested volume, and the highest measured one below it."""
         setting = self.evidence.setting
         times = {
-            row.volume_veh_per_lane_h: row.travel_s
+            row.volume_veh_per_lane_h: travel_s
             for row in self.evidence.points
-            if row.label == label and row.travel_s is not None
+            if row.label == label and (travel_s := row.mean("travel_s")) is not None
         }
         if setting is None:
             return None, None
@@ -208,17 +208,17 @@ class _Judge:
     def _bound(self) -> Statement:
         row, setting = self._row("paper-12", 1750.0), self.evidence.setting
         text = "At most 3600 v_F / 2 d_F can be carried"
-        if row is None or row.throughput_veh_per_lane_h is None or setting is None:
+        rate = None if row is None else row.mean("throughput_veh_per_lane_h")
+        if rate is None or setting is None:
             return Statement(text, MISSING, "")
         bound = paper_bound(setting.speed_mps, setting.pitch_m)
         text += f", here {bound:g} veh/(lane h)"
-        rate = row.throughput_veh_per_lane_h
         measured = f"`paper-12` carries {rate:.0f} of 1750"
         beyond = [
-            f"`{label}` carries {found.throughput_veh_per_lane_h:.0f} of {volume:g}"
+            f"`{label}` carries {carried:.0f} of {volume:g}"
             for label, volume in (("formations", 2000.0), ("rolling", 2400.0))
             if (found := self._row(label, volume)) is not None
-            and (found.throughput_veh_per_lane_h or 0.0) > bound
+            and (carried := found.mean("throughput_veh_per_lane_h") or 0.0) > bound
         ]
         if beyond:
             measured += "; the bound applies to interlaced entry, not to the lattice: "
@@ -230,9 +230,8 @@ class _Judge:
         rows, missing = self._rows(*CLOSED)
         if not rows:
             return Statement(text, MISSING, "")
-        off = sum(row.demanded - row.on_preferred_lane for row in rows)
-        overlaps = sum(row.overlaps for row in rows)
-        vehicles = sum(row.demanded for row in rows)
+        off, vehicles = _off(rows)
+        overlaps = sum(row.total("overlaps") for row in rows)
         measured = f"{overlaps} overlaps, {off} of {vehicles:,} vehicles not in their lane"
         return Statement(text, measured, _all([not overlaps and not off, *missing]))
 
@@ -241,8 +240,8 @@ class _Judge:
         rows, missing = self._rows(*INTERPRETATIONS)
         if not rows:
             return Statement(text, MISSING, "")
-        off = sum(row.demanded - row.on_preferred_lane for row in rows)
-        measured = f"{off} of {sum(row.demanded for row in rows):,} did not reach their lane"
+        off, vehicles = _off(rows)
+        measured = f"{off} of {vehicles:,} did not reach their lane"
         return Statement(text, measured, _all([not off, *missing]))
 
     def _sumo_blocks(self) -> Statement:
@@ -250,11 +249,11 @@ class _Judge:
         rows, missing = self._rows("lc2013")
         if not rows:
             return Statement(text, MISSING, "")
-        off = sum(row.demanded - row.on_preferred_lane for row in rows)
+        off, vehicles = _off(rows)
         last = rows[-1]
         measured = (
-            f"`lc2013`: {off} of {sum(row.demanded for row in rows):,} did not reach their lane; "
-            f"{number(last.travel_s, 1)} s at {last.volume_veh_per_lane_h:g}"
+            f"`lc2013`: {off} of {vehicles:,} did not reach their lane; "
+            f"{number(last.mean('travel_s'), 1)} s at {last.volume_veh_per_lane_h:g}"
         )
         verdict = HOLDS if off else "not observed"
         return Statement(text, measured, _provisional(verdict, missing))
@@ -264,9 +263,15 @@ class _Judge:
         parts = []
         for label in CLOSED:
             row = self._row(label, 1600.0)
-            found = None if row is None else row.planning_p95_ms
+            found = None if row is None else row.highest("planning_p95_ms")
             parts.append(f"`{label}` {MISSING if found is None else f'{found:.0f} ms'}")
         return Statement(text, "planning at 1600, p95: " + ", ".join(parts), NOT_JUDGED)
+
+
+def _off(rows: Sequence[PointRow]) -> tuple[int, int]:
+    """Return how many vehicles did not reach their lane, and how many there were."""
+    demanded = sum(row.total("demanded") for row in rows)
+    return demanded - sum(row.total("on_preferred_lane") for row in rows), demanded
 
 
 def _onset(first: float | None, below: float | None) -> str:

@@ -1,9 +1,10 @@
-"""The generated parts of docs/EVALUATION.md as Markdown."""
+"""The generated parts of docs/EVALUATION_*.md as Markdown."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
+from evaluation.comparisons import comparison
 from evaluation.evidence import Evidence
 from evaluation.goals import goals_table
 from evaluation.markdown import MISSING, NOT_RUN, markdown, number
@@ -20,6 +21,9 @@ def document_parts(evidence: Evidence) -> dict[str, str]:
         "evaluation lanes": _by_volume(evidence, _lanes),
         "evaluation margins": _by_volume(evidence, _margins),
         "evaluation brakes": _by_volume(evidence, _brakes),
+        "evaluation safety": _by_volume(evidence, _safety),
+        "evaluation comfort": _by_volume(evidence, _comfort),
+        "evaluation comparison": comparison(evidence),
         "evaluation throughput": _by_volume(evidence, _throughput),
         "evaluation planning": _planning(evidence),
         "evaluation lattice": _lattice(evidence),
@@ -68,31 +72,51 @@ def _runs(row: PointRow) -> str:
 
 
 def _travel_time(row: PointRow) -> str:
-    return f"{number(row.travel_s, 2)} ({number(row.travel_p95_s, 1)})"
+    bounds = row.interval("travel_s")
+    known = "" if bounds is None else f" [{bounds.low:.2f}, {bounds.high:.2f}]"
+    return f"{number(row.mean('travel_s'), 2)}{known} ({number(row.mean('travel_p95_s'), 1)})"
 
 
 def _lanes(row: PointRow) -> str:
-    off = row.left - row.on_preferred_lane
+    off = row.total("left") - row.total("on_preferred_lane")
     share = "100" if not off else number(row.on_lane_percent, 3)
     return f"{share} %" + (f" ({off} off)" if off else "")
 
 
 def _margins(row: PointRow) -> str:
     figures = (
-        number(row.min_gap_m, 2),
-        number(row.min_headway_s, 2),
-        number(row.min_accel_mps2, 1),
+        number(row.lowest("min_gap_m"), 2),
+        number(row.lowest("min_headway_s"), 2),
+        number(row.lowest("min_accel_mps2"), 1),
     )
     text = " / ".join(figures)
-    return text + (f", **{row.overlaps} overlaps**" if row.overlaps else "")
+    overlaps = row.total("overlaps")
+    return text + (f", **{overlaps} overlaps**" if overlaps else "")
 
 
 def _brakes(row: PointRow) -> str:
-    return number(100.0 * row.emergency_brakes / row.demanded, 1) if row.demanded else "-"
+    demanded = row.total("demanded")
+    return number(100.0 * row.total("emergency_brakes") / demanded, 1) if demanded else "-"
+
+
+def _safety(row: PointRow) -> str:
+    runs = [run for run in row.complete if run.ttc_below_3_s is not None]
+    left = sum(run.left for run in runs)
+    if not left:
+        return NOT_RUN
+    exposed_s = sum(run.ttc_below_3_s or 0.0 for run in runs) / left
+    hard = 100.0 * sum(run.hard_brakes or 0 for run in runs) / left
+    closest = (number(row.lowest("min_ttc_s"), 2), f"{exposed_s:.3f}")
+    return " / ".join((*closest, number(row.lowest("min_pet_s"), 2), f"{hard:.1f} %"))
+
+
+def _comfort(row: PointRow) -> str:
+    share, co2 = row.mean("uncomfortable_percent"), row.mean("co2_g_per_km")
+    return NOT_RUN if share is None else f"{number(share, 1)} % / {number(co2, 1)}"
 
 
 def _throughput(row: PointRow) -> str:
-    return number(row.throughput_veh_per_lane_h, 0)
+    return number(row.mean("throughput_veh_per_lane_h"), 0)
 
 
 def _planning(evidence: Evidence) -> str:
@@ -104,7 +128,7 @@ def _planning(evidence: Evidence) -> str:
             f"`{one.solver}`",
             f"{one.plans:,}",
             *(number(value, 1) for value in (one.p50_ms, one.p95_ms, one.max_ms)),
-            f"{row.fallbacks} of {row.plans:,}",
+            f"{row.total('fallbacks')} of {row.total('plans'):,}",
         ]
         for row in evidence.points
         if row.label in FORMATIONS
@@ -132,7 +156,7 @@ def _lattice(evidence: Evidence) -> str:
                 f"{number(traced.lattice_least_m, 2)} m",
                 f"{number(traced.lattice_worst_off_m, 2)} m",
                 "holds" if traced.lattice_kept else "**broken**",
-                f"{number(row.min_accel_mps2, 2)} to {number(row.max_accel_mps2, 2)} m/s2",
+                _accels(row),
                 "holds" if row.within_limits else "**broken**",
             ]
         )
@@ -141,6 +165,11 @@ def _lattice(evidence: Evidence) -> str:
         "accelerations of all runs", "limits",
     ]  # fmt: skip
     return markdown(headings, rows)
+
+
+def _accels(row: PointRow) -> str:
+    low, high = row.lowest("min_accel_mps2"), row.highest("max_accel_mps2")
+    return f"{number(low, 2)} to {number(high, 2)} m/s2"
 
 
 def _agreement(evidence: Evidence) -> str:

@@ -1,4 +1,4 @@
-"""The results of roads that docs/EVALUATION.md shows support its sentences."""
+"""The results of roads that docs/EVALUATION_ROADS.md shows support its sentences."""
 
 from __future__ import annotations
 

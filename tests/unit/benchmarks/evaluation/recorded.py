@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from attrs import evolve
 
 from evaluation.evidence import Evidence, setting_of
-from evaluation.points import PointRow, Traced
+from evaluation.points import PointRow, RunRow, Traced
 from laneweave.launch.recordings.runs import Run
 from laneweave.launch.run_methods import METHODS
 from laneweave.protocol.config.scenario_files import load_scenario
@@ -45,9 +46,9 @@ def run(
 
 
 TRACED = Traced(
-    runs=5,
+    runs=1,
     lattice_least_m=14.93,
-    lattice_pairs=20_000,
+    lattice_pairs=4000,
     lattice_worst_off_m=0.07,
     lattice_kept=True,
     slow_m=None,
@@ -55,33 +56,51 @@ TRACED = Traced(
 )
 
 
-def point(label: str, volume: float, travel_s: float, traced: Traced | None = TRACED) -> PointRow:
-    """Return a point of five seeds without failures."""
-    return PointRow(
-        label=label,
-        volume_veh_per_lane_h=volume,
-        seeds=(1, 2, 3, 4, 5),
-        failed=(),
-        demanded=4000,
-        left=4000,
-        on_preferred_lane=4000,
-        travel_s=travel_s,
-        travel_sd_s=0.1,
-        travel_p95_s=travel_s + 1.0,
-        throughput_veh_per_lane_h=volume,
-        overlaps=0,
-        emergency_brakes=0,
-        min_gap_m=9.8,
-        min_headway_s=0.86,
-        min_accel_mps2=-6.8,
-        max_accel_mps2=4.8,
-        within_limits=True,
-        largest_formation=6,
-        planning_p95_ms=12.0,
-        traced=traced,
-    )
+def point(
+    label: str,
+    volume: float,
+    travel_s: float | None,
+    traced: Traced | None = TRACED,
+    seeds: Sequence[int] = (1, 2, 3, 4, 5),
+) -> PointRow:
+    """Return a point without failures, with 800 vehicles in each run."""
+    runs = [
+        RunRow(
+            label,
+            volume,
+            seed,
+            "",
+            complete=True,
+            demanded=800,
+            left=800,
+            on_preferred_lane=800,
+            travel_s=travel_s,
+            travel_p95_s=None if travel_s is None else travel_s + 1.0,
+            throughput_veh_per_lane_h=volume,
+            hard_brakes=0,
+            min_gap_m=9.8,
+            min_headway_s=0.86,
+            min_accel_mps2=-6.8,
+            max_accel_mps2=4.8,
+            min_ttc_s=2.9,
+            ttc_below_3_s=4.0,
+            min_pet_s=0.66,
+            uncomfortable_percent=0.31,
+            co2_g_per_km=133.8,
+            planning_p95_ms=12.0,
+            traced=traced,
+        )
+        for seed in seeds
+    ]
+    return PointRow(label, volume, tuple(runs))
+
+
+def changed(row: PointRow, **figures: Any) -> PointRow:  # noqa: ANN401 - any of RunRow
+    """Return a point with other figures in its last run."""
+    return evolve(row, runs=(*row.runs[:-1], evolve(row.runs[-1], **figures)))
 
 
 def evidence(*points: PointRow) -> Evidence:
     """Return evidence of some points, in the setting of the evaluation."""
-    return Evidence(setting=setting_of([run("rule", 1000.0, 1, None)]), points=points)
+    setting = setting_of([run("rule", 1000.0, 1, None)])
+    return Evidence(setting=setting, runs=tuple(one for row in points for one in row.runs))

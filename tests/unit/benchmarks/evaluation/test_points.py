@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
 from pathlib import Path
 
 import pytest
 from attrs import evolve
 
-from evaluation.points import PlanningTimes, point_rows
+from evaluation.points import PlanningTimes, PointRow, points_of_runs, run_rows
 from evaluation.programme import (
     FORMATIONS,
     GOALS,
@@ -20,35 +21,56 @@ from evaluation.programme import (
     points_of,
 )
 from evaluation.trials import TRIALS, agreement, agreement_rows, is_finished
+from laneweave.launch.recordings.runs import Run
 from laneweave.launch.run_methods import METHODS
 from laneweave.protocol.config.scenario_files import load_scenario
 from laneweave.protocol.errors import BadInputError
-from unit.benchmarks.evaluation.recorded import BASE, run, summary
+from unit.benchmarks.evaluation.recorded import BASE, point, run, summary
 
 ROOT = Path(__file__).resolve().parents[4]
 
 
+def rows_of(runs: Iterable[Run]) -> tuple[PointRow, ...]:
+    return points_of_runs(run_rows(runs))
+
+
+def test_planning_times_over_the_seeds() -> None:
+    runs = [
+        evolve(one, planning=(PlanningTimes("tappa", plans, *times_ms),))
+        for one, plans, times_ms in zip(
+            point("formations", 1000.0, 67.0, seeds=(1, 2, 3)).runs,
+            (10, 20, 30),
+            ((1.0, 9.0, 10.0), (2.0, 5.0, 30.0), (6.0, 7.0, 8.0)),
+            strict=True,
+        )
+    ]
+    (row,) = points_of_runs(runs)
+    assert row.planning == (PlanningTimes("tappa", 60, 2.0, 9.0, 30.0),)
+
+
 def test_means_extremes_and_sums_over_seeds() -> None:
     safety = {"overlaps": 2, "min_gap_m": 4.0, "min_accel_mps2": -10.5}
-    (row,) = point_rows(
+    (row,) = rows_of(
         [
             run("rule", 1600.0, 2, summary(72.0, safety=safety), "2 pairs of vehicles overlapped"),
             run("rule", 1600.0, 1, summary(70.0, vehicles={"on_preferred_lane": 99})),
         ]
     )
     assert row.seeds == (1, 2)
-    assert row.failed == ((2, "2 pairs of vehicles overlapped"),)
-    assert (row.travel_s, row.travel_p95_s) == (71.0, 72.0)
-    assert row.travel_sd_s == pytest.approx(1.414, abs=1e-3)
-    assert (row.left, row.on_preferred_lane, row.on_lane_percent) == (200, 199, 99.5)
-    assert (row.overlaps, row.min_gap_m, row.min_accel_mps2) == (2, 4.0, -10.5)
+    assert [(one.seed, one.reason) for one in row.failed] == [(2, "2 pairs of vehicles overlapped")]
+    assert (row.mean("travel_s"), row.mean("travel_p95_s")) == (71.0, 72.0)
+    assert (row.total("left"), row.total("on_preferred_lane")) == (200, 199)
+    assert row.on_lane_percent == 99.5
+    assert row.total("overlaps") == 2
+    assert (row.lowest("min_gap_m"), row.lowest("min_accel_mps2")) == (4.0, -10.5)
+    assert row.highest("max_accel_mps2") == 4.8
     assert not row.within_limits
     assert row.traced is None
 
 
 def test_runs_that_were_cut_off_are_in_no_figure() -> None:
     cut = summary(500.0, ending="limit")
-    (row,) = point_rows(
+    (row,) = rows_of(
         [
             run("rule", 1600.0, 1, summary(70.0)),
             run("rule", 1600.0, 2, cut, "the run is not complete: limit"),
@@ -56,13 +78,13 @@ def test_runs_that_were_cut_off_are_in_no_figure() -> None:
         ]
     )
     assert row.seeds == (1,)
-    assert [seed for seed, _ in row.failed] == [2, 3]
-    assert (row.travel_s, row.travel_sd_s, row.demanded) == (70.0, None, 100)
+    assert [one.seed for one in row.failed] == [2, 3]
+    assert (row.values("travel_s"), row.total("demanded")) == ([70.0], 100)
 
 
 def test_rows_are_in_the_order_of_labels_and_volumes() -> None:
     runs = [run(label, volume, 1, summary(70.0)) for volume in (1600.0, 1000.0) for label in LABELS]
-    rows = [(row.label, row.volume_veh_per_lane_h) for row in point_rows(runs)]
+    rows = [(row.label, row.volume_veh_per_lane_h) for row in rows_of(runs)]
     assert rows == [
         (label, volume) for label in METHODS if label in LABELS for volume in (1000, 1600)
     ]
@@ -71,13 +93,13 @@ def test_rows_are_in_the_order_of_labels_and_volumes() -> None:
 def test_runs_that_cannot_be_compared() -> None:
     one = run("rule", 1600.0, 1, summary(70.0))
     with pytest.raises(BadInputError, match="only once"):
-        point_rows([one, evolve(one, folder=Path("other"))])
+        rows_of([one, evolve(one, folder=Path("other"))])
     shorter = evolve(one.scenario.demand, duration_s=300.0)
     with pytest.raises(BadInputError, match="duration_s = 600"):
-        point_rows([one, evolve(one, scenario=evolve(one.scenario, demand=shorter, seed=2))])
+        rows_of([one, evolve(one, scenario=evolve(one.scenario, demand=shorter, seed=2))])
     longer = evolve(BASE.road, s2_m=900.0)
     with pytest.raises(BadInputError, match="as in the other runs"):
-        point_rows([one, evolve(one, scenario=evolve(one.scenario, road=longer, seed=2))])
+        rows_of([one, evolve(one, scenario=evolve(one.scenario, road=longer, seed=2))])
 
 
 def trip(vehicle: str, lane: int | None, travel_s: float | None) -> dict[str, object]:
@@ -135,8 +157,8 @@ def test_planning_times_are_those_of_each_solver(tmp_path: Path) -> None:
     (tmp_path / "events.jsonl").write_text("".join(json.dumps(one) + "\n" for one in events))
     found = summary(70.0, planning={"plans": 6, "fallbacks": 2})
     one = evolve(run("formations", 1000.0, 1, found), folder=tmp_path)
-    (row,) = point_rows([one, run("formations", 1000.0, 2, summary(70.0, planning={"plans": 4}))])
-    assert (row.plans, row.fallbacks) == (10, 2)
+    (row,) = rows_of([one, run("formations", 1000.0, 2, summary(70.0, planning={"plans": 4}))])
+    assert (row.total("plans"), row.total("fallbacks")) == (10, 2)
     assert row.planning == (
         PlanningTimes("branching", 2, 6.0, 6.9, 7.0),
         PlanningTimes("rolling", 1, 3.5, 3.5, 3.5),

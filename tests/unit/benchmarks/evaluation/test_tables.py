@@ -3,24 +3,28 @@
 from __future__ import annotations
 
 import json
+import math
 import signal
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 from attrs import evolve
 
 import evaluate
+from evaluation.comparisons import comparison
 from evaluation.evidence import Evidence, Picture, read_evidence, write_evidence
 from evaluation.goals import goals_table, meets
-from evaluation.points import PlanningTimes
+from evaluation.intervals import interval
+from evaluation.points import PlanningTimes, points_of_runs
 from evaluation.programme import FORMATIONS, GOALS, LABELS, VOLUMES, Goal, planned
 from evaluation.statements import PAPER_VOLUMES, statements_table
 from evaluation.tables import document_parts
 from evaluation.trials import Agreement, AgreementRow, CostRow, FactorRow
 from laneweave.protocol.errors import BadInputError
 from support.tables import for_each
-from unit.benchmarks.evaluation.recorded import TRACED, evidence, point
+from unit.benchmarks.evaluation.recorded import TRACED, changed, evidence, point
 
 
 def cells(table: str, first: str) -> list[str]:
@@ -39,10 +43,10 @@ def full() -> Evidence:
         if planned(label, volume)
     ]
     jam = evolve(TRACED, slow_m=(500.0, 800.0), slowest_mps=3.0)
-    rows = [evolve(row, traced=jam) if row.label.startswith("rule") else row for row in rows]
+    rows = [changed(row, traced=jam) if row.label.startswith("rule") else row for row in rows]
     times_ms = (PlanningTimes("tappa", 990, 1.5, 20.25, 800.0),)
     rows = [
-        evolve(row, plans=1000, fallbacks=9, planning=times_ms)
+        changed(row, plans=1000, fallbacks=9, planning=times_ms)
         if row.label == "formations"
         else row
         for row in rows
@@ -84,25 +88,26 @@ def test_nothing_is_missing() -> None:
 
 
 def test_cells() -> None:
-    some = evolve(
-        point("lc2013", 1000.0, 67.123),
-        seeds=(1, 2),
-        failed=((2, "1 pairs of vehicles overlapped"),),
+    some = changed(
+        point("lc2013", 1000.0, 67.123, seeds=(1, 2)),
+        reason="1 pairs of vehicles overlapped",
         overlaps=1,
         emergency_brakes=8,
-        on_preferred_lane=3998,
+        on_preferred_lane=798,
     )
     parts = document_parts(evidence(some))
     place = 1 + LABELS.index("lc2013")
     shown = {name: cells(parts[f"evaluation {name}"], "1000")[place] for name in (
-        "runs", "travel times", "lanes", "margins", "brakes", "throughput"
+        "runs", "travel times", "lanes", "margins", "brakes", "safety", "comfort", "throughput"
     )}  # fmt: skip
     assert shown == {
         "runs": "2 of 5, 1 failed",
         "travel times": "67.12 (68.1)",
-        "lanes": "99.950 % (2 off)",
+        "lanes": "99.875 % (2 off)",
         "margins": "9.80 / 0.86 / -6.8, **1 overlaps**",
-        "brakes": "0.2",
+        "brakes": "0.5",
+        "safety": "2.90 / 0.005 / 0.66 / 0.0 %",
+        "comfort": "0.3 % / 133.8",
         "throughput": "1000",
     }
     assert "Arrivals in each run: 600 s." in parts["evaluation runs"]
@@ -110,7 +115,7 @@ def test_cells() -> None:
 
 def test_a_point_whose_runs_all_failed() -> None:
     parts = document_parts(
-        evidence(evolve(point("rule", 1000.0, 0.0), seeds=(), failed=((1, "x"),)))
+        evidence(changed(point("rule", 1000.0, 0.0, seeds=(1,)), complete=False, reason="x"))
     )
     assert cells(parts["evaluation travel times"], "1000")[1 + LABELS.index("rule")] == "failed"
     assert cells(parts["evaluation runs"], "1000")[1 + LABELS.index("rule")] == "0 of 5, 1 failed"
@@ -141,16 +146,16 @@ def test_points_at_and_beyond_their_goals() -> None:
     goal = Goal("rolling", 2200.0, 67.5, 99.95)
     assert not meets(row, evolve(goal, travel_s=67.4))
     # Shares are of all demanded vehicles, of which there are 4000.
-    assert meets(evolve(row, on_preferred_lane=3998), goal)
-    assert not meets(evolve(row, on_preferred_lane=3997), goal)
-    assert not meets(evolve(row, travel_s=None), goal)
-    row = evolve(point("formations", 1600.0, 66.0), plans=200, fallbacks=2)
-    row = evolve(row, min_accel_mps2=-3.504, max_accel_mps2=3.1)
+    assert meets(changed(row, on_preferred_lane=798), goal)
+    assert not meets(changed(row, on_preferred_lane=797), goal)
+    assert not meets(point("rolling", 2200.0, None), goal)
+    row = changed(point("formations", 1600.0, 66.0, seeds=(1,)), plans=200, fallbacks=2)
+    row = changed(row, min_accel_mps2=-3.504, max_accel_mps2=3.1)
     goal = Goal("formations", 1600.0, 66.9, accel_mps2=3.5, fallback_percent=1.0)
     assert goal in GOALS
     assert meets(row, goal)
     for worse in ({"fallbacks": 3}, {"min_accel_mps2": -3.51}, {"max_accel_mps2": None}):
-        assert not meets(evolve(row, **worse), goal)
+        assert not meets(changed(row, **worse), goal)
 
 
 def test_planning_times() -> None:
@@ -160,7 +165,7 @@ def test_planning_times() -> None:
 
 
 def test_a_violated_guarantee_is_a_missed_goal() -> None:
-    bad = evolve(
+    bad = changed(
         point("rolling", 2400.0, 66.0, evolve(TRACED, lattice_least_m=14.2, lattice_kept=False)),
         overlaps=1,
         within_limits=False,
@@ -193,7 +198,7 @@ def test_interpretations_of_the_rules_may_differ() -> None:
     table = statements_table(evidence(*rows))
     assert cells(table, "The rules bring")[2] == "so far: holds"
     assert "seeds yet" not in table
-    assert "5 seeds yet" in statements_table(evidence(evolve(rows[0], seeds=(1,))))
+    assert "5 seeds yet" in statements_table(evidence(point("rule", 1000.0, 67.0, seeds=(1,))))
     for statement in ("Severe congestion", "Formation control is faster"):
         assert cells(table, statement)[2] == "so far: depends on the interpretation"
     assert "`rule` minus `paper-6` -1.0, -1.0, -1.0, -1.0, -1.0 s" in table
@@ -204,7 +209,7 @@ def test_evidence_is_what_was_written(tmp_path: Path) -> None:
     assert read_evidence(path) == Evidence()
     write_evidence(full(), path)
     assert read_evidence(path) == full()
-    path.write_text(json.dumps({"schema": "laneweave.evaluation/1", "speed": 1}))
+    path.write_text(json.dumps({"schema": "laneweave.evaluation/2", "runs": [], "speed": 1}))
     with pytest.raises(BadInputError, match="speed"):
         read_evidence(path)
 
@@ -215,11 +220,10 @@ def test_parts_and_labels_without_new_runs_are_kept() -> None:
     assert old.updated_with(new) == evolve(old, factors=old.factors[:1])
     points = evidence(point("rule", 1000.0, 70.0))
     updated_with = old.updated_with(points)
-    others = [row for row in old.points if row.label != "rule"]
-    assert len(others) < len(old.points)
-    assert sorted(updated_with.points, key=lambda row: row.label) == sorted(
-        [*others, *points.points], key=lambda row: row.label
-    )
+    others = [row for row in old.runs if row.label != "rule"]
+    assert len(others) < len(old.runs)
+    assert len(updated_with.runs) == len(others) + len(points.runs)
+    assert all(row in updated_with.runs for row in (*others, *points.runs))
     assert updated_with.pictures == ()
     assert updated_with.costs == old.costs
 
@@ -231,6 +235,56 @@ def test_points_of_other_settings_are_not_mixed() -> None:
     with pytest.raises(BadInputError, match=r"duration_s=600\.0.* as for formations"):
         full().updated_with(longer)
     assert new.updated_with(longer) == longer
+
+
+def test_formation_control_is_compared_seed_by_seed() -> None:
+    """Differences of 1 s in each seed are significant, though seeds differ by 10 s."""
+    seeds = range(1, 11)
+    rows = [
+        points_of_runs(
+            evolve(one, travel_s=60.0 + 2.0 * one.seed + more_s + 0.1 * (one.seed % 3))
+            for one in point(label, 1000.0, 0.0, seeds=seeds).runs
+        )[0]
+        for label, more_s in (("formations", 0.0), ("rule", 1.0), ("lc2013", -1.0))
+    ]
+    noisy = [
+        evolve(one, travel_s=80.0 - 2.0 * one.seed)
+        for one in point("rule-net", 1000.0, 0.0, seeds=seeds).runs
+    ]
+    few = point("lc2013-4s", 1000.0, 99.0, seeds=(1, 2))
+    text = comparison(evidence(*rows, *points_of_runs(noisy), few))
+    (sentence,) = [line for line in text.splitlines() if line.startswith("- At 1000")]
+    assert sentence == (
+        "- At 1000, `formations` is faster than `rule`; **slower than** `lc2013`; "
+        "not different from `rule-net`; not compared with `lc2013-4s`."
+    )
+    shown = cells(text.split("\n\n")[0], "1000")
+    assert shown[1] == "-1.00 [-1.00, -1.00]"
+    assert shown[3] == "missing"
+
+
+def test_intervals() -> None:
+    values = np.random.default_rng(3).normal(10.0, 2.0, 20).tolist()
+    found = interval(values)
+    assert found is not None
+    half = 2.093 * np.std(values, ddof=1) / np.sqrt(20)  # Student's t
+    assert found.low == pytest.approx(np.mean(values) - half, abs=0.35)
+    assert found.high == pytest.approx(np.mean(values) + half, abs=0.35)
+    assert interval(values) == found
+    assert interval([1.0] * 10) == (1.0, 1.0)
+    assert interval(values[:9]) is None
+    assert interval([*values, math.nan]) is None
+    equal = [1e9 + 1e-7 * number for number in range(10)]
+    assert interval(equal) == (min(equal), max(equal))
+
+
+def test_intervals_contain_the_mean_as_often_as_they_say() -> None:
+    rng = np.random.default_rng(0)
+    inside = 0
+    for _ in range(100):
+        found = interval(rng.normal(0.0, 1.0, 10).tolist())
+        inside += found is not None and found.low <= 0.0 <= found.high
+    assert inside >= 87
 
 
 @for_each(
