@@ -103,7 +103,7 @@ def _safety_rows(safety: Safety) -> Iterator[Row]:
         ("smallest gap", safety.min_gap_m, " m"),
         ("smallest headway", safety.min_headway_s, " s"),
         ("smallest time to collision", safety.min_ttc_s, " s"),
-        ("smallest post-encroachment time of a lane change", safety.min_pet_s, " s"),
+        ("smallest post-encroachment time", safety.min_pet_s, " s"),
         ("lowest acceleration", safety.min_accel_mps2, _accel_unit(safety.min_accel_mps2)),
         ("highest acceleration", safety.max_accel_mps2, _accel_unit(safety.max_accel_mps2)),
     )

@@ -107,7 +107,7 @@ class Rows:
 
 
 class _Distribution:
-    """Number of values by class: root mean square and percentiles of any number of values."""
+    """Counts of values by class, from which their root mean square and percentiles follow."""
 
     def __init__(self, bin_width: float) -> None:
         self._bin_width = bin_width
