@@ -42,7 +42,10 @@ TIMEOUT_S: Final = 300.0
 
 def emission_program() -> Path | None:
     """Return SUMO's program; None: the package eclipse-sumo is not installed."""
-    package = importlib.util.find_spec("sumo")
+    try:
+        package = importlib.util.find_spec("sumo")
+    except ModuleNotFoundError:
+        return None
     if package is None or package.origin is None:
         return None
     path = Path(package.origin).parent / "bin" / "emissionsDrivingCycle"
