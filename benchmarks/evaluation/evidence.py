@@ -66,7 +66,7 @@ class Evidence:
         """The runs by label and volume, over their seeds."""
         return points_of_runs(self.runs)
 
-    @property
+    @cached_property
     def by_key(self) -> dict[Key, PointRow]:
         """The points by label and volume."""
         return {(row.label, row.volume_veh_per_lane_h): row for row in self.points}

@@ -27,7 +27,7 @@ from laneweave.protocol.wire.messages import CAR
 
 COMMONROAD_FILE: Final = "commonroad.xml"
 FIRST_OBSTACLE: Final = 1000
-"""Number of the first vehicle; those below are of lanelets."""
+"""Number of the first vehicle; lanelets have smaller numbers."""
 
 
 def write_commonroad(recording: Recording, path: Path) -> list[Path]:

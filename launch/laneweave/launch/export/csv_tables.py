@@ -8,10 +8,8 @@ import pyarrow as pa
 import pyarrow.csv as csv
 import pyarrow.parquet as pq
 
-from laneweave.launch.export.recording import check_period, within
+from laneweave.launch.export.recording import trajectories_within, within
 from laneweave.launch.recordings.runs import unreadable
-from laneweave.launch.recordings.trajectories import read_trajectories
-from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.files import write_atomically
 from laneweave.sim_bridge.recording.columns import TICKS, TRAJECTORIES, TRIPS
 
@@ -23,7 +21,7 @@ def write_csv(run: Path, folder: Path, from_s: float | None, to_s: float | None)
 
     Args:
         run: the run's folder.
-        folder: folder of the files.
+        folder: folder of the files, created if necessary.
         from_s: road time of the first trajectories and ticks; None: all.
         to_s: road time of the last ones.
 
@@ -31,11 +29,7 @@ def write_csv(run: Path, folder: Path, from_s: float | None, to_s: float | None)
         BadInputError: a table cannot be read, or has no rows in this time.
         OSError: a file cannot be written.
     """
-    check_period(from_s, to_s)
-    tables = {"trajectories": (TRAJECTORIES, within(read_trajectories(run), from_s, to_s))}
-    if not tables["trajectories"][1].num_rows and (from_s, to_s) != (None, None):
-        value = f"{from_s or 0.0:g} to {'the end' if to_s is None else f'{to_s:g}'}"
-        raise BadInputError("--from, --to", value, "a time in which vehicles were on the road")
+    tables = {"trajectories": (TRAJECTORIES, trajectories_within(run, from_s, to_s))}
     for name, declared in (("trips", TRIPS), ("ticks", TICKS)):
         file = run / f"{name}.parquet"
         if file.is_file():
@@ -44,6 +38,7 @@ def write_csv(run: Path, folder: Path, from_s: float | None, to_s: float | None)
             except (OSError, ValueError) as error:
                 raise unreadable(run, file.name, error) from error
             tables[name] = (declared, table if declared is TRIPS else within(table, from_s, to_s))
+    folder.mkdir(parents=True, exist_ok=True)
     files = [_write(table, folder / f"{name}.csv") for name, (_, table) in tables.items()]
     described = [
         {

@@ -1,4 +1,4 @@
-"""SUMO's floating car data (FCD), which SUMO's own scripts plot, and the road as its network."""
+"""Trajectories as SUMO's floating car data (FCD), and the road as a SUMO network."""
 
 from __future__ import annotations
 

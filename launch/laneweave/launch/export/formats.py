@@ -79,7 +79,7 @@ def _write(
 
 
 def _csv_folder(run: Path, out: Path | None) -> Path:
-    """Return the folder of CSV files, created if necessary.
+    """Return the folder of CSV files.
 
     Raises:
         BadInputError: `run` is not the folder of a run, or `out` is a file or has the name of one.
@@ -88,7 +88,6 @@ def _csv_folder(run: Path, out: Path | None) -> Path:
     path = out or run / FOLDER
     if path.is_file() or path.suffix == ".csv":
         raise BadInputError("--out", str(path), "a folder")
-    path.mkdir(parents=True, exist_ok=True)
     return path
 
 

@@ -43,7 +43,6 @@ from laneweave.launch.drawing.colours import NEUTRAL, lane_colours
 from laneweave.launch.export.recording import Recording
 from laneweave.launch.recordings.formations import read_events
 from laneweave.launch.recordings.runs import unreadable
-from laneweave.launch.recordings.trajectories import read_trips
 from laneweave.protocol.files import write_atomically
 
 MCAP_FILE: Final = "run.mcap"
@@ -149,9 +148,9 @@ def _colours(recording: Recording) -> list[Color]:
     """Return the colour of each vehicle."""
     lanes = [_colour(text) for text in lane_colours(recording.scenario.road.lanes)]
     neutral = _colour(NEUTRAL)
-    trips = read_trips(recording.folder)
-    preferred = [int(trips.get(name, {}).get("preferred_lane", -1)) for name in recording.names]
-    return [lanes[lane] if 0 <= lane < len(lanes) else neutral for lane in preferred]
+    return [
+        lanes[lane] if 0 <= lane < len(lanes) else neutral for lane in recording.preferred_lanes
+    ]
 
 
 def _sizes(recording: Recording) -> list[Vector3]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Self
@@ -16,6 +16,7 @@ from attrs import frozen
 from laneweave.launch.recordings.runs import single_run, unreadable
 from laneweave.launch.recordings.trajectories import Floats, Ints, read_trajectories, read_trips
 from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.road_layout import ANY_LANE
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.wire.messages import CAR
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import TURNING_MPS
@@ -23,12 +24,23 @@ from laneweave.sim_bridge.bodies.overlaps_and_gaps import TURNING_MPS
 _COLUMNS = ("s_m", "y_m", "speed_mps", "lateral_speed_mps", "accel_mps2")
 
 
-def check_period(from_s: float | None, to_s: float | None) -> None:
-    """Check a part of a run.
+def trajectories_within(
+    folder: Path, from_s: float | None, to_s: float | None, columns: Sequence[str] | None = None
+) -> pa.Table:
+    """Return the trajectories of a part of a run; see `Recording.read` and `read_trajectories`.
 
     Raises:
-        BadInputError: a time is not finite, or the first one is after the last one.
+        BadInputError: the part is not valid or without vehicles, or the run cannot be read.
     """
+    _check_period(from_s, to_s)
+    table = within(read_trajectories(folder, columns), from_s, to_s)
+    if not table.num_rows and (from_s, to_s) != (None, None):
+        value = f"{from_s or 0.0:g} to {'the end' if to_s is None else f'{to_s:g}'}"
+        raise BadInputError("--from, --to", value, "a time in which vehicles were on the road")
+    return table
+
+
+def _check_period(from_s: float | None, to_s: float | None) -> None:
     for name, value in (("--from", from_s), ("--to", to_s)):
         if value is not None and not math.isfinite(value):
             raise BadInputError(name, value, "a road time in s")
@@ -55,6 +67,8 @@ class Recording:
     """Names of the vehicles."""
     types: tuple[str, ...]
     """Type of each vehicle."""
+    preferred_lanes: tuple[int, ...]
+    """Preferred lane of each vehicle, or `ANY_LANE`."""
     vehicle: Ints
     """Index of each row's vehicle."""
     t_s: Floats
@@ -80,22 +94,17 @@ class Recording:
         Raises:
             BadInputError: the folder has no readable run, or there are no vehicles in this time.
         """
-        check_period(from_s, to_s)
         scenario = single_run(folder).scenario
-        table = read_trajectories(folder, ["t_s", "vehicle", *_COLUMNS, "lane"])
-        table = within(table, from_s, to_s)
+        table = trajectories_within(folder, from_s, to_s, ["t_s", "vehicle", *_COLUMNS, "lane"])
         if not table.num_rows:
-            if from_s is None and to_s is None:
-                raise BadInputError("RUN", str(folder), "a run with vehicles on the road")
-            value = f"{from_s or 0.0:g} to {'the end' if to_s is None else f'{to_s:g}'}"
-            allowed = "a time in which vehicles were on the road"
-            raise BadInputError("--from, --to", value, allowed)
+            raise BadInputError("RUN", str(folder), "a run with vehicles on the road")
         codes = table["vehicle"].combine_chunks().dictionary_encode()
         names = tuple(str(name) for name in codes.dictionary)
         try:
-            trips = read_trips(folder)
+            recorded = read_trips(folder)
         except (OSError, ValueError, KeyError) as error:
             raise unreadable(folder, "trips.parquet", error) from error
+        trips = [recorded.get(name, {}) for name in names]
         found = {name: np.nan_to_num(table[name].to_numpy()).astype(float) for name in _COLUMNS}
         ahead_mps = np.maximum(found["speed_mps"], 0.0)
         turned = np.minimum(ahead_mps / TURNING_MPS, 1.0)
@@ -103,7 +112,8 @@ class Recording:
             folder=folder,
             scenario=scenario,
             names=names,
-            types=tuple(str(trips.get(name, {}).get("vehicle_type", CAR)) for name in names),
+            types=tuple(str(trip.get("vehicle_type", CAR)) for trip in trips),
+            preferred_lanes=tuple(int(trip.get("preferred_lane", ANY_LANE)) for trip in trips),
             vehicle=codes.indices.to_numpy().astype(np.int64),
             t_s=table["t_s"].to_numpy(),
             s_m=found["s_m"],

@@ -7,7 +7,6 @@ one type; slopes are zero.
 
 from __future__ import annotations
 
-import importlib.util
 import math
 import os
 import subprocess
@@ -25,6 +24,7 @@ from laneweave.launch.recordings.runs import TRAJECTORIES, unreadable
 from laneweave.protocol.errors import CommandFailedError
 from laneweave.protocol.runtime.temporary_folders import temporary_folder
 from laneweave.protocol.summary import EnergyFigures
+from laneweave.sim_bridge.sumo.simulation import sumo_program
 
 MODELS: Final[Mapping[str, str]] = {
     "petrol": "HBEFA4/PC_petrol_Euro-6d",
@@ -38,18 +38,6 @@ _SUMS: Final = "sums"
 """Line of the program's output before the sums."""
 TIMEOUT_S: Final = 300.0
 """Longest time for `ROWS_AT_ONCE` rows, which take a second."""
-
-
-def emission_program() -> Path | None:
-    """Return SUMO's program; None: the package eclipse-sumo is not installed."""
-    try:
-        package = importlib.util.find_spec("sumo")
-    except ModuleNotFoundError:
-        return None
-    if package is None or package.origin is None:
-        return None
-    path = Path(package.origin).parent / "bin" / "emissionsDrivingCycle"
-    return path if path.is_file() else None
 
 
 def energy_of(folder: Path, models: Mapping[str, str] = MODELS) -> dict[str, EnergyFigures] | None:
@@ -66,8 +54,8 @@ def energy_of(folder: Path, models: Mapping[str, str] = MODELS) -> dict[str, Ene
         CommandFailedError: a model does not exist, or its results are not finite.
         OSError: there is no room for temporary files, or the program cannot be started.
     """
-    program = emission_program()
-    if program is None or not (folder / TRAJECTORIES).is_file():
+    program = sumo_program("emissionsDrivingCycle")
+    if program is None or not program.is_file() or not (folder / TRAJECTORIES).is_file():
         return None
     totals = {model: Counter[str]() for model in models.values()}
     speeds = 0.0

@@ -72,38 +72,29 @@ class Rows:
         numbers = codes.indices.to_numpy().astype(np.int64)
         return cls([str(name) for name in codes.dictionary], numbers, *columns)
 
+    @property
+    def columns(self) -> tuple[Floats, ...]:
+        """All values, in the order of the fields."""
+        return self.t_s, self.s_m, self.y_m, self.speed_mps, self.accel_mps2
+
     def finite(self) -> Rows:
-        """Return the rows whose values are all finite: methods of users may give any."""
-        values = (self.t_s, self.s_m, self.y_m, self.speed_mps, self.accel_mps2)
-        good = np.all([np.isfinite(column) for column in values], axis=0)
-        return Rows(self.names, self.vehicle[good], *(column[good] for column in values))
+        """Return the rows whose values are all finite; plug-in methods may record others."""
+        good = np.all([np.isfinite(column) for column in self.columns], axis=0)
+        return Rows(self.names, self.vehicle[good], *(column[good] for column in self.columns))
 
     def joined(self, later: Rows) -> Rows:
         """Return these rows followed by later ones."""
         numbers = {name: number for number, name in enumerate(self.names)}
         places = [numbers.setdefault(name, len(numbers)) for name in later.names]
-        return Rows(
-            list(numbers),
-            np.concatenate([self.vehicle, np.array(places, dtype=np.int64)[later.vehicle]]),
-            np.concatenate([self.t_s, later.t_s]),
-            np.concatenate([self.s_m, later.s_m]),
-            np.concatenate([self.y_m, later.y_m]),
-            np.concatenate([self.speed_mps, later.speed_mps]),
-            np.concatenate([self.accel_mps2, later.accel_mps2]),
-        )
+        vehicle = [self.vehicle, np.array(places, dtype=np.int64)[later.vehicle]]
+        pairs = zip(self.columns, later.columns, strict=True)
+        return Rows(list(numbers), np.concatenate(vehicle), *map(np.concatenate, pairs))
 
     def since(self, first: int) -> Rows:
         """Return the rows from a number on, without names that do not occur in them."""
         kept, vehicle = np.unique(self.vehicle[first:], return_inverse=True)
-        return Rows(
-            [self.names[number] for number in kept],
-            vehicle.astype(np.int64),
-            self.t_s[first:],
-            self.s_m[first:],
-            self.y_m[first:],
-            self.speed_mps[first:],
-            self.accel_mps2[first:],
-        )
+        names = [self.names[number] for number in kept]
+        return Rows(names, vehicle.astype(np.int64), *(column[first:] for column in self.columns))
 
 
 class _Distribution:

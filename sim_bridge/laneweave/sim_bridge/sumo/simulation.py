@@ -136,6 +136,18 @@ class SumoProcess:
         self.close()
 
 
+def sumo_program(name: str) -> Path | None:
+    """Return a program of SUMO; None: the package eclipse-sumo is not installed."""
+    try:
+        package = importlib.util.find_spec("sumo")
+    except ModuleNotFoundError:
+        return None
+    if package is None or package.origin is None:
+        return None
+    suffix = ".exe" if sys.platform == "win32" else ""
+    return Path(package.origin).parent / "bin" / f"{name}{suffix}"
+
+
 def check_screen() -> None:
     """Check that there is a screen for a window.
 
@@ -162,11 +174,9 @@ class SumoGui:
         """
         if program == "sumo-gui":
             check_screen()
-        package, traci = importlib.util.find_spec("sumo"), _load_traci()
-        if package is None or package.origin is None or traci is None:
+        binary, traci = sumo_program(program), _load_traci()
+        if binary is None or traci is None:
             raise CommandFailedError(MISSING)
-        suffix = ".exe" if sys.platform == "win32" else ""
-        binary = Path(package.origin).parent / "bin" / f"{program}{suffix}"
         command = [str(binary), "--net-file", str(network), "--step-length", f"{tick_s:g}"]
         command += [
             "--collision.action",

@@ -245,7 +245,7 @@ def test_time_to_collision_and_deceleration() -> None:
     assert measured([beside]).min_ttc_s == math.inf
 
 
-def test_nobody_collides_with_a_faster_vehicle() -> None:
+def test_a_faster_vehicle_ahead_is_no_conflict() -> None:
     found = measured([{"a": Row(100.0, lane_y_m(0)), "b": Row(110.0, lane_y_m(0), 16.0)}])
     assert (found.min_ttc_s, found.max_drac_mps2) == (math.inf, 0.0)
     assert set(found.ttc_below_s.values()) == {0.0}
