@@ -27,6 +27,7 @@ if __name__ == "__main__":  # same paths as `pythonpath` in pyproject.toml
 
 
 import laneweave
+import radio
 import roads
 import surprises
 from api_reference import api_reference, documented
@@ -50,6 +51,7 @@ from laneweave.launch.fault_search.profiles import PROFILES
 from laneweave.launch.observe.findings import RULES, FindingsMetrics
 from laneweave.launch.observe.metrics_server import PROCESS, PROCESS_MEANING
 from laneweave.launch.recordings.results_over_seeds import RESULTS
+from laneweave.protocol.radio.radio_core import RadioMetrics
 from laneweave.protocol.runtime.metrics import (
     MetricsSnapshot,
     NodeMetrics,
@@ -120,6 +122,7 @@ SNAPSHOTS: dict[type[MetricsSnapshot], str] = {
     BridgeMetrics: "bridge",
     RouterMetrics: "router",
     SettingsMetrics: "coordinator, agent",
+    RadioMetrics: "coordinator, agent, bridge",
     FindingsMetrics: "watch, at its own address",
 }
 """Classes of metrics, each with the role that serves them."""
@@ -928,6 +931,7 @@ def parts() -> dict[str, str]:
         "service": _service(),
         "stability": _stability(),
         "surprises": _surprises(),
+        "radio": radio.table(DOCS / "evidence" / radio.RECORD),
         "stream": _stream(),
         "roads": _road_results(faults=False),
         "roads under faults": _road_results(faults=True),

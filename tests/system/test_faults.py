@@ -79,6 +79,24 @@ def test_half_of_all_messages_are_lost(lab: Lab) -> None:
     assert found["faults"]["injected"] == []
 
 
+def test_messages_by_radio(lab: Lab) -> None:
+    """A loaded channel loses many; fleets decide for each of their vehicles."""
+    radio = '\n[radio]\ntechnology = "802.11p"\nother_senders_per_km = 400.0\n'
+    road, folder = lab.path("radio.toml", SHORT_ROAD + radio), lab.folder / "out"
+
+    options = ("--duration", "12", "--vehicles-per-process", "4", "--pace", "5")
+    ended = lab.run("run", road, *DEMAND, *options, "--out", folder)
+
+    assert ended.status == 0, ended
+    check_safe_and_complete(folder)
+    found = summary(folder)
+    vehicles, messages = found["vehicles"], found["messages"]
+    assert vehicles["on_preferred_lane"] == vehicles["left"] > 0
+    for channel in ("sidelink", "cellular"):
+        assert 0 < messages[f"{channel}_lost"] < messages[channel] / 2
+    assert messages["dropped_by_faults"] == 0
+
+
 @pytest.mark.more
 def test_nothing_arrives_from_the_start(lab: Lab) -> None:
     road = lab.path("blackout.toml", BLACKOUT_ROAD)

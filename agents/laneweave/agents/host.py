@@ -136,10 +136,9 @@ class AgentHost:
     def handle(self, event: Event, now_s: float) -> list[Effect]:
         """Handle an event; see `Core`."""
         if isinstance(event, Arrived) and isinstance(event.message, Motion):
-            motion = event.message  # changes no subscription
-            for name, agent in self._agents.items():
-                if name != motion.vehicle and motion.stretch in agent.wanted_motions:
-                    agent.on_motion(motion)
+            for name in self.listeners(event.message):  # changes no subscription
+                if event.vehicles is None or name in event.vehicles:
+                    self._agents[name].on_motion(event.message)
             return []
         try:
             if isinstance(event, Arrived):
@@ -150,6 +149,18 @@ class AgentHost:
         except BadInputError as error:
             return [Refuse(error)]
         return effects
+
+    def listeners(self, message: Motion | VehicleState) -> list[Name]:
+        """Return the vehicles of this process that need a message of another vehicle now."""
+        if isinstance(message, Motion):
+            return [
+                name
+                for name, agent in self._agents.items()
+                if name != message.vehicle and message.stretch in agent.wanted_motions
+            ]
+        return [
+            name for name, agent in self._agents.items() if message.block in agent.wanted_states
+        ]
 
     def _on_event(self, event: Event, now_s: float) -> list[Effect]:
         match event:
@@ -182,9 +193,10 @@ class AgentHost:
         message = event.message
         if isinstance(message, VehicleState):
             effects, changed = [], False
-            for agent in self._agents.values():
-                wanted = agent.wanted_states
-                if message.block in wanted:
+            for name in self.listeners(message):
+                if event.vehicles is None or name in event.vehicles:
+                    agent = self._agents[name]
+                    wanted = agent.wanted_states
                     effects += agent.handle(event, now_s)
                     changed = changed or agent.wanted_states != wanted
             if changed:

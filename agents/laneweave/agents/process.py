@@ -9,6 +9,7 @@ from laneweave.agents.core import AgentCore
 from laneweave.agents.driving.driver import TrackingDriver
 from laneweave.agents.host import AgentHost
 from laneweave.protocol.lattice import displacements
+from laneweave.protocol.radio.radio_core import over_radio
 from laneweave.protocol.runtime.message_faults import CoreWrapper, unwrapped
 from laneweave.protocol.runtime.metrics import Observe, unobserved
 from laneweave.protocol.runtime.settings_check import CheckedCore, Process
@@ -20,7 +21,7 @@ from laneweave.protocol.transports.zenoh.runner import run_core
 from laneweave.protocol.vehicle.motion import cell_state
 from laneweave.protocol.wire.identities import Incarnations, parse_identity
 from laneweave.protocol.wire.messages import CurrentMotion, Name, Sense, VehicleRecord
-from laneweave.protocol.wire.topics import SENSE
+from laneweave.protocol.wire.topics import SENSE, Party
 
 
 def warm_up(scenario: Scenario) -> None:
@@ -79,5 +80,6 @@ def run_agents(
         shard,
     )
     settings = settings_of(scenario)
-    core = CheckedCore(host, process, settings, SENSE)
+    received = over_radio(host, scenario, Party.VEHICLE, process.name, host.listeners)
+    core = CheckedCore(received, process, settings, SENSE)
     run_core(wrap(core), access, observe=observe)

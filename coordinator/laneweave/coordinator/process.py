@@ -15,6 +15,7 @@ from attrs import frozen
 from laneweave.coordinator.core import CoordinatorCore
 from laneweave.coordinator.planning.kernels import BRANCHING, ROLLING, BackgroundCompilation
 from laneweave.coordinator.planning.solve import plan, prepare
+from laneweave.protocol.radio.radio_core import over_radio
 from laneweave.protocol.runtime.message_faults import CoreWrapper, unwrapped
 from laneweave.protocol.runtime.metrics import (
     MetricsSnapshot,
@@ -88,7 +89,8 @@ def run_coordinator(
         plan=partial(plan, compiled_only=True),
     )
     process = Process.of(Identity(Party.COORDINATOR, name), incarnation)
-    checked = CheckedCore(core, process, settings_of(scenario), CENSUS)
+    received = over_radio(core, scenario, Party.COORDINATOR, name)
+    checked = CheckedCore(received, process, settings_of(scenario), CENSUS)
     with contextlib.closing(WorkerPool(workers, _load_branching)) as pool:
         if fork_workers:
             pool.fork()  # before the compilation starts a thread

@@ -256,6 +256,14 @@ class Messages:
     published: int = figure("messages published by all processes")
     dropped_by_faults: int = figure("messages dropped by injected faults")
     rejected: int | None = optional("malformed messages that were received")
+    sidelink: int | None = optional(
+        "messages between vehicles, for each receiver; null: without a radio"
+    )
+    sidelink_lost: int | None = optional("those that the radio lost")
+    cellular: int | None = optional(
+        "messages between vehicles and coordinators, for each receiver; null: without a radio"
+    )
+    cellular_lost: int | None = optional("those that the radio lost")
 
 
 @frozen(kw_only=True)

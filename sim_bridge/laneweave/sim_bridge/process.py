@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from contextlib import ExitStack
 from pathlib import Path
 
+from laneweave.protocol.radio.radio_core import over_radio
 from laneweave.protocol.runtime.message_faults import CoreWrapper, unwrapped
 from laneweave.protocol.runtime.metrics import Observe, unobserved
 from laneweave.protocol.runtime.processes import interrupts_deferred
@@ -15,6 +16,7 @@ from laneweave.protocol.security.access_control import access_of
 from laneweave.protocol.summary import Ending
 from laneweave.protocol.transports.zenoh.runner import run_core
 from laneweave.protocol.wire.identities import Incarnations
+from laneweave.protocol.wire.topics import Party
 from laneweave.sim_bridge.core import BridgeCore
 from laneweave.sim_bridge.recording.run_record import RunRecord
 from laneweave.sim_bridge.road.obstacles import Breakdown
@@ -64,4 +66,5 @@ def run_bridge(
             )
             # Also after an error, to save the recorded data.
             closing.callback(lambda: record.close(core.t_s, Ending.INTERRUPTED))
-        run_core(wrap(core), access, observe=observe)
+        received = over_radio(core, scenario, Party.BRIDGE, Party.BRIDGE)
+        run_core(wrap(received), access, observe=observe)

@@ -35,6 +35,7 @@ from laneweave.sim_bridge.road.caretakers import Caretakers
 from laneweave.sim_bridge.road.entry import Admission
 from laneweave.sim_bridge.road.occupied_cells import OccupiedCells
 from laneweave.sim_bridge.road.roadside import Roadside
+from laneweave.sim_bridge.road.sender_density import measure_density
 from laneweave.sim_bridge.road.tick_answers import Answers
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
 
@@ -209,6 +210,8 @@ class SimulatedRoad(Generic[VehicleT]):
         self._roadside.assign_empty_cells(self.vehicles)
         yield from self._roadside.publish(self.tick, self.t_s, self.vehicles.values())
         yield from self._start_caretakers(now_s)
+        if self.scenario.radio.enabled:
+            measure_density(self.vehicles.values(), self.scenario.road.length_m)
         sensed = list[Name]()
         for vehicle in self.vehicles.values():
             vehicle.controller.end_move(self.t_s)

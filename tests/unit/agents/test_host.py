@@ -136,6 +136,24 @@ def test_states_go_to_the_members_of_their_formation(formation: int) -> None:
     assert not state.go  # B has not heard A
 
 
+def test_a_vehicle_that_has_not_received_a_message_does_not_know_of_it() -> None:
+    """Over a radio, vehicles of one process do not all hear the same."""
+    host = make_host(A, B, C)
+    cells: dict[Name, Cell] = {A: FRONT, B: SIDE, C: (-2, 2)}
+    for name, cell in cells.items():
+        feel(host, name, cell)
+    states = sent(accept(host, cells), VehicleState)
+    last = {state.vehicle: state for state in states if state.ready}
+    assert host.listeners(last[C]) == [A, B, C]
+    assert host.listeners(replace(last[C], block=1)) == []
+    for state in last.values():
+        event = node.Arrived(topics.STATE, token(state.vehicle), state, frozenset({A}))
+        give(host, event)
+    for name, goes in ((A, True), (B, False)):
+        (state,) = sent(feel(host, name, cells[name], 2), VehicleState)
+        assert state.go is goes
+
+
 @pytest.mark.parametrize(("rear", "formations"), [(SIDE, (0,)), ((-4, 0), (0, 1))])
 def test_host_subscribes_to_all_formations_of_a_plan_while_an_agent_waits(
     rear: Cell, formations: tuple[int, ...]

@@ -23,6 +23,7 @@ from laneweave.launch.run.outcome import Outcome, complete_summary
 from laneweave.launch.run.progress import RunProgress
 from laneweave.launch.run_methods import FORMATION
 from laneweave.protocol.config.participants import coordinator_names
+from laneweave.protocol.radio.radio_core import over_radio
 from laneweave.protocol.runtime.message_faults import FaultyCore
 from laneweave.protocol.runtime.node import Arrived, Core, Effect, Event, Listen, Started
 from laneweave.protocol.runtime.processes import stop_signals
@@ -32,6 +33,7 @@ from laneweave.protocol.transports.simulated.network import SimulatedNetwork
 from laneweave.protocol.transports.simulated.virtual_time import Conditions
 from laneweave.protocol.wire.events import FAULT_INJECTED
 from laneweave.protocol.wire.messages import Census, Name
+from laneweave.protocol.wire.topics import Party
 from laneweave.sim_bridge.core import BridgeCore, TickPhase
 from laneweave.sim_bridge.recording.run_record import RunRecord
 from laneweave.sim_bridge.road_sources import RunDemand, demand_of, open_road
@@ -207,7 +209,7 @@ class SimulatedRun:
         network.add("watcher", _ObserverCore(self._view, self._start_agents), realm)
         for name in self._roles.coordinators:
             self._start(name)
-        self._add(BRIDGE, bridge, "bridge", BRIDGE)
+        self._add(BRIDGE, over_radio(bridge, self.scenario, Party.BRIDGE, BRIDGE), "bridge", BRIDGE)
         shown = advanced_tick = 0
         advanced_s = 0.0
         while bridge.phase is not TickPhase.ENDED and network.queue and not self._stop:
@@ -256,13 +258,15 @@ class SimulatedRun:
         """Start or restart a coordinator or an agent."""
         if name in self._roles.coordinators:
             incarnation = next(self._coordinator_incarnations)
-            core = CoordinatorCore(Name(name), incarnation, self.scenario)
+            coordinator = CoordinatorCore(Name(name), incarnation, self.scenario)
+            core = over_radio(coordinator, self.scenario, Party.COORDINATOR, name)
             self._add(name, core, "coordinator", name)
         else:
             vehicle = Name(name.removeprefix(AGENT_PREFIX))
             incarnation, runtime = next(self._incarnations), self.scenario.runtime
             host = AgentHost(vehicle, self._make_agent, incarnation, runtime, [vehicle])
-            self._add(name, host, "vehicle", vehicle)
+            core = over_radio(host, self.scenario, Party.VEHICLE, vehicle, host.listeners)
+            self._add(name, core, "vehicle", vehicle)
 
     def _add(self, name: str, core: Core, receiver: str, own_name: str) -> None:
         """Add a role to the network.

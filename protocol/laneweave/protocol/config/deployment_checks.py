@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from itertools import chain
 
+from attrs import evolve
+
 from laneweave.protocol.config.participants import (
     demanded_vehicles,
     identities_of,
@@ -13,6 +15,7 @@ from laneweave.protocol.config.rules import compare, require
 from laneweave.protocol.errors import BadInputError, raise_all
 from laneweave.protocol.field_validators import host_of, is_encrypted
 from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.radio_table import C_V2X, DSRC, Radio
 from laneweave.protocol.wire.identities import MAX_COMMON_NAME
 
 MAX_SECURED_VEHICLES = 5000
@@ -34,6 +37,14 @@ def check_periods(scenario: Scenario) -> None:
             ("network.lease_s", "at most", silent_s, what),
         ],
     )
+
+
+def check_radio(scenario: Scenario) -> None:
+    """Check that a radio is named if values of it are given."""
+    radio = scenario.radio
+    named = evolve(radio, technology=C_V2X) == Radio(technology=C_V2X)
+    allowed = f'"{C_V2X}" or "{DSRC}" with other values of the table'
+    require(radio.enabled or named, "radio.technology", radio.technology, allowed)
 
 
 def check_sumo(scenario: Scenario) -> None:

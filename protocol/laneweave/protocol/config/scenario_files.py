@@ -36,6 +36,7 @@ _CHECKS = (
         motion_checks.check_settling,
     ),
     (deployment_checks.check_periods,),
+    (deployment_checks.check_radio,),
     (deployment_checks.check_sumo,),
     (deployment_checks.check_security,),
 )

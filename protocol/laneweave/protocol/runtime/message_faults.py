@@ -9,10 +9,8 @@ same seed and arrivals give the same faults.
 
 from __future__ import annotations
 
-import heapq
 import random
-from collections.abc import Callable, Iterable, Iterator
-from itertools import count
+from collections.abc import Callable, Iterable
 from typing import Any, Protocol
 
 import attrs
@@ -21,16 +19,8 @@ from attrs import field, frozen
 from laneweave.protocol.errors import BadInputError, unknown_name
 from laneweave.protocol.field_validators import within, within_or_none
 from laneweave.protocol.names import NAME_PATTERN
-from laneweave.protocol.runtime.metrics import MetricsSnapshot
-from laneweave.protocol.runtime.node import (
-    Arrived,
-    Core,
-    Effect,
-    Event,
-    Send,
-    Wakeup,
-    core_metrics,
-)
+from laneweave.protocol.runtime.delaying_core import DelayingCore
+from laneweave.protocol.runtime.node import Arrived, Core, Effect, Send
 from laneweave.protocol.structuring import KEY
 from laneweave.protocol.wire.messages import Plan, Prepare, RoadClock
 from laneweave.protocol.wire.topics import ANY_SENDER, ROLES, TOPICS, Party
@@ -44,8 +34,6 @@ Route = tuple[str | None, str | None]
 """Sender and receiver of messages, each the kind or the name of a process; None: any."""
 CoreWrapper = Callable[[Core], Core]
 """Wraps a core, or returns it unchanged."""
-MAX_HELD = 10_000
-"""Maximum number of delayed messages; further ones are dropped."""
 
 
 def _message_topics(_: object, attribute: attrs.Attribute[Any], value: tuple[str, ...]) -> None:
@@ -148,7 +136,7 @@ class FaultBoard(Protocol):
     """Number of dropped messages; each `FaultyCore` adds its own."""
 
 
-class FaultyCore:
+class FaultyCore(DelayingCore):
     """A `Core` that injects message faults into the input of another core."""
 
     def __init__(
@@ -171,7 +159,7 @@ class FaultyCore:
             seed: seed of all draws, unique to the process.
             names: name of the process, or of each vehicle that it drives.
         """
-        self.core = core
+        super().__init__(core)
         self._board = board
         self._kind = receiver
         self._receivers = frozenset((None, receiver, *names))
@@ -182,54 +170,21 @@ class FaultyCore:
         """Rules of each topic, with their routes."""
         self._seed = seed
         self._generators: dict[str, random.Random] = {}
-        self._held: list[tuple[float, int, Arrived]] = []
-        self._order = count()
 
-    @property
-    def metrics(self) -> Iterable[MetricsSnapshot]:
-        """Metrics of the wrapped core."""
-        return core_metrics(self.core)
+    def _passed(self, effect: Effect) -> Effect:
+        if isinstance(effect, Send) and isinstance(effect.message, RoadClock):
+            self._board.road_s = effect.message.t_s
+        return effect
 
-    @property
-    def wakeup_s(self) -> float | None:
-        """Time of the next delayed message or of the core's wakeup, whichever is earlier."""
-        wakeup_s = self.core.wakeup_s
-        if not self._held:
-            return wakeup_s
-        return self._held[0][0] if wakeup_s is None else min(wakeup_s, self._held[0][0])
+    def _on_overflow(self) -> None:
+        self._board.dropped += 1
 
-    def handle(self, event: Event, now_s: float) -> Iterator[Effect]:
-        """Handle an event; see `Core`."""
-        match event:
-            case Arrived():
-                effects: Iterable[Effect] = self._on_arrived(event, now_s)
-            case Wakeup():
-                effects = self._on_wakeup(event, now_s)
-            case _:
-                effects = self.core.handle(event, now_s)
-        for effect in effects:
-            if isinstance(effect, Send) and isinstance(effect.message, RoadClock):
-                self._board.road_s = effect.message.t_s
-            yield effect
-
-    def _on_arrived(self, arrived: Arrived, now_s: float) -> Iterator[Effect]:
+    def _copies(self, arrived: Arrived, now_s: float) -> Iterable[tuple[float, Arrived]]:
+        del now_s
         delays_s = self._copy_delays_s(arrived)
         if not delays_s:
             self._board.dropped += 1
-        for delay_s in delays_s:
-            if delay_s <= 0.0:
-                yield from self.core.handle(arrived, now_s)
-            elif len(self._held) < MAX_HELD:
-                heapq.heappush(self._held, (now_s + delay_s, next(self._order), arrived))
-            else:
-                self._board.dropped += 1
-
-    def _on_wakeup(self, wakeup: Wakeup, now_s: float) -> Iterator[Effect]:
-        while self._held and self._held[0][0] <= now_s:
-            yield from self.core.handle(heapq.heappop(self._held)[2], now_s)
-        wakeup_s = self.core.wakeup_s
-        if wakeup_s is not None and wakeup_s <= now_s:
-            yield from self.core.handle(wakeup, now_s)
+        return [(delay_s, arrived) for delay_s in delays_s]
 
     def _copy_delays_s(self, arrived: Arrived) -> list[float]:
         """Return the delay of each copy of a message [s]; empty if the message is dropped."""

@@ -63,6 +63,8 @@ class Arrived:
     topic: Topic
     parameters: Mapping[str, str]
     message: Any
+    vehicles: frozenset[str] | None = None
+    """Vehicles of an agent process that have received it; None: all that it concerns."""
 
 
 @frozen

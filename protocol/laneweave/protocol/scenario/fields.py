@@ -23,6 +23,7 @@ from laneweave.protocol.scenario.deployment_fields import (
     SumoSettings,
 )
 from laneweave.protocol.scenario.formation_table import FormationSettings
+from laneweave.protocol.scenario.radio_table import Radio
 from laneweave.protocol.scenario.road_geometry import RoadGeometry
 from laneweave.protocol.scenario.road_tables import Demand, Entrance, Exit, Road, TypeShare
 from laneweave.protocol.scenario.timing import Timing
@@ -63,6 +64,7 @@ class Scenario:
     rule: RuleSettings = RuleSettings()
     lc2013: Lc2013Settings = Lc2013Settings()
     network: Network = Network()
+    radio: Radio = Radio()
     runtime: Runtime = Runtime()
     security: Security = Security()
     service: Service = Service()

@@ -173,6 +173,10 @@ class Bounds:
         _check_count("solves", report.solves, solves)
         _check_count("unusable", report.unusable, report.solves)
         _check_count("osqp_solves", report.osqp_solves, report.solves)
+        for link in ("sidelink", "cellular"):
+            sent = getattr(report, link)
+            _check_count(link, sent, messages)
+            _check_count(f"{link}_lost", getattr(report, f"{link}_lost"), sent)
         size = len(report.solve_ms)
         if size % _DURATION.size or size > _DURATION.size * report.solves:
             allowed = f"at most {report.solves} durations of {_DURATION.size} bytes"

@@ -311,6 +311,9 @@ class Sense(Message, frozen=True):
     into the lattice. Its motion controller drives alone."""
     vehicle_type: Name = Name(CAR)
     """Type of the vehicle, which determines its limits."""
+    senders_per_km: Real = 0.0
+    """Vehicles of the road per km of it around the vehicle, as the load of a radio channel shows;
+    only with a radio (`radio.technology`)."""
 
 
 class Command(Message, frozen=True):

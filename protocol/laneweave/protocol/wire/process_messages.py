@@ -77,6 +77,15 @@ class Report(Message, frozen=True):
     """Number of solves with OSQP; the others used `tracking.shortcut`."""
     solve_ms: bytes = b""
     """CPU time of each solve [ms], little-endian float32."""
+    sidelink: Int64 = 0
+    """Number of messages of other vehicles to the sender, lost ones included; only with a radio."""
+    sidelink_lost: Int64 = 0
+    """Number of those that were lost."""
+    cellular: Int64 = 0
+    """Number of messages between vehicles and coordinators to the sender, lost ones included; only
+    with a radio."""
+    cellular_lost: Int64 = 0
+    """Number of those that were lost."""
 
 
 class LogEvent(Message, frozen=True):

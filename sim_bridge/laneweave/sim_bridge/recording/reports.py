@@ -10,7 +10,7 @@ import numpy as np
 from attrs import define, field
 from numpy.typing import NDArray
 
-from laneweave.protocol.summary import DurationMs
+from laneweave.protocol.summary import DurationMs, Messages
 from laneweave.protocol.wire.messages import Name
 from laneweave.protocol.wire.process_messages import Report
 from laneweave.sim_bridge.recording.statistics import finite
@@ -21,7 +21,8 @@ of its agent has left the road, and coordinators report every 2 s."""
 MAX_SOLVE_MS = 1000.0
 """Longer solves count as this long."""
 _BINS_PER_MS = 1000
-_SUMMED = ("solves", "unusable", "osqp_solves")
+_RADIO = ("sidelink", "sidelink_lost", "cellular", "cellular_lost")
+_SUMMED = ("solves", "unusable", "osqp_solves", *_RADIO)
 _OF_PROCESS = ("published", "rejected")
 
 
@@ -95,6 +96,15 @@ class ReportTotals:
     def total(self, counter: str) -> int:
         """Return the sum of a counter over all senders, or over all processes."""
         return self._final[counter] + sum(self._not_final(counter))
+
+    def messages(self, *, radio: bool) -> Messages:
+        """Return the counts of messages; `radio`: whether the run has a radio."""
+        return Messages(
+            published=self.total("published"),
+            dropped_by_faults=0,
+            rejected=self.total("rejected"),
+            **{name: self.total(name) if radio else None for name in _RADIO},
+        )
 
     def solve_ms(self) -> DurationMs:
         """Return statistics of all durations."""

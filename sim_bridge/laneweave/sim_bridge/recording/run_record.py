@@ -38,7 +38,6 @@ from laneweave.protocol.summary import (
     SCHEMA,
     Ending,
     LeaderChanges,
-    Messages,
     RunSummary,
     RuntimeFigures,
     Tracking,
@@ -461,11 +460,7 @@ class RunRecord:
                 vehicles_per_process=scenario.runtime.vehicles_per_process,
                 tick_ms=self._ticks.durations(),
             ),
-            messages=Messages(
-                published=self._reports.total("published"),
-                dropped_by_faults=0,
-                rejected=self._reports.total("rejected"),
-            ),
+            messages=self._reports.messages(radio=scenario.radio.enabled),
             failover=LeaderChanges(
                 leader_changes=self._leadership.changes,
                 recovery_s=self._leadership.recovery_s,

@@ -62,6 +62,8 @@ class RoadVehicle:
     sense_rate: SenseRate = field(factory=SenseRate)
     processes: tuple[Name, ...] = ()
     """Processes with an agent for it, as in `CensusEntry`."""
+    senders_per_km: float = 0.0
+    """As in `Sense`."""
 
     @classmethod
     def entering(
@@ -246,6 +248,7 @@ class RoadVehicle:
             bridge=self.bridge,
             off_lattice=controller.off_lattice is not None,
             vehicle_type=Name(self.arrival.vehicle_type),
+            senders_per_km=self.senders_per_km,
         )
 
     def send_sense(self, tick: int, *, caretaker: bool = False, left: bool = False) -> list[Effect]:

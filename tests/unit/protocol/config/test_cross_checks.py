@@ -20,6 +20,8 @@ LATE = {"reaction_s": 0.4}
 FOUR = {"cycle_s": 4.0}
 MISFITS: list[tuple[str, dict[str, Any]]] = [
     ("formation.settle_s", {"formation": {"settle_s": 3.1}}),
+    ("radio.technology", {"radio": {"power_dbm": 20.0}}),
+    ("radio.technology", {"radio": {"technology": "none", "cellular_loss": 0.0}}),
     ("formation.settle_s", {"formation": {"settle_s": 5.0, "operation": "paper"}}),
     ("formation.settle_s", {"vehicle": {"max_speed_mps": 15.5}, "formation": {"settle_s": 28.1}}),
     ("demand.lane_shares", {"demand": {"lane_shares": [0.5, 0.5]}}),

@@ -8,7 +8,7 @@ from unittest.mock import Mock
 import pytest
 from attrs import define
 
-from laneweave.protocol.runtime import message_faults, node
+from laneweave.protocol.runtime import delaying_core, message_faults, node
 from laneweave.protocol.runtime.message_faults import FaultyCore, MessageRule
 from laneweave.protocol.runtime.metrics import RouterMetrics
 from laneweave.protocol.runtime.transport import LinkDown, LinkUp
@@ -287,7 +287,7 @@ def test_the_core_is_woken_when_it_wants_and_not_for_delayed_messages(wanted_s: 
 
 
 def test_no_more_messages_are_delayed_than_allowed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(message_faults, "MAX_HELD", 5)
+    monkeypatch.setattr(delaying_core, "MAX_HELD", 5)
     board = Board()
     core, listener = faulty(MessageRule(delay_s=1.0), board=board)
     for number in range(8):
