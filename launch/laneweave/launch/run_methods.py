@@ -87,7 +87,7 @@ def _paper(max_vehicles: int, block_columns: int) -> LabelledMethod:
     )
 
 
-_SUMO_HUMAN: Final = {
+_SUMO_HUMAN: Final[dict[str, object]] = {
     "lc2013.headway_s": 1.0,
     "lc2013.min_gap_m": 2.5,
     "lc2013.imperfection": 0.5,
@@ -95,14 +95,15 @@ _SUMO_HUMAN: Final = {
     "lc2013.decel_mps2": 4.5,
 }
 """SUMO's defaults for passenger cars, except that all drivers desire v_F."""
-_SUMO_IDEAL: Final = {"lc2013.decel_mps2": 4.5}
+_SUMO_IDEAL: Final[dict[str, object]] = {"lc2013.decel_mps2": 4.5}
 """Vehicles without imperfection that follow with moderate braking."""
-_SUMO_COOPERATIVE: Final = _SUMO_IDEAL | {
+_SUMO_COOPERATIVE: Final[dict[str, object]] = _SUMO_IDEAL | {
     "lc2013.min_gap_m": 1.0,
     "lc2013.strategic": 10.0,
     "lc2013.assertive": 2.0,
 }
 """Vehicles that change lanes early and accept small gaps."""
+_SL2015: Final[dict[str, object]] = {"lc2013.model": "SL2015"}
 
 METHODS: Final[dict[str, LabelledMethod]] = {
     "formation": LabelledMethod(FORMATION),
@@ -118,11 +119,15 @@ METHODS: Final[dict[str, LabelledMethod]] = {
     "lc2013-4s": LabelledMethod(LC2013, {"lc2013.lane_change_s": 4.0}),
     "lc2013-human": LabelledMethod(LC2013, _SUMO_HUMAN),
     "lc2013-ideal": LabelledMethod(LC2013, _SUMO_IDEAL),
+    "lc2013-ideal-4s": LabelledMethod(LC2013, _SUMO_IDEAL | {"lc2013.lane_change_s": 4.0}),
     "lc2013-cooperative": LabelledMethod(LC2013, _SUMO_COOPERATIVE),
     "lc2013-cooperative-4s": LabelledMethod(
         LC2013, _SUMO_COOPERATIVE | {"lc2013.lane_change_s": 4.0}
     ),
-    "sl2015-cooperative": LabelledMethod(LC2013, _SUMO_COOPERATIVE | {"lc2013.model": "SL2015"}),
+    "sl2015": LabelledMethod(LC2013, _SL2015),
+    "sl2015-human": LabelledMethod(LC2013, _SUMO_HUMAN | _SL2015),
+    "sl2015-ideal": LabelledMethod(LC2013, _SUMO_IDEAL | _SL2015),
+    "sl2015-cooperative": LabelledMethod(LC2013, _SUMO_COOPERATIVE | _SL2015),
 }
 """Built-in methods by label, in the order of tables and figures."""
 

@@ -50,7 +50,9 @@ LISTEN_S = 0.5
 heartbeats it has missed."""
 MAX_DELAY_S = 1.0
 """Time into its slot after which a plan that is not in force is dropped."""
-
+HEAR_S = 1.0
+"""Time for which a snapshot is put off while a vehicle has not been heard that should move in this
+slot: a plan from its former cell would be void for it, and for the owners of the cells it needs."""
 AGAIN_S = 1.4
 """Time before a slot until which it is planned again if other parts of lanes are closed."""
 
@@ -203,6 +205,8 @@ class RollingOperation:
             self._newest_slot = slot
         if slot < self._newest_slot or t_s <= snapshot_s or now_s < self._since[1] + LISTEN_S:
             return
+        if t_s <= snapshot_s + HEAR_S and self._is_mover_unheard(slot):
+            return
         if max(self._since[0], t_s - 1.5 * self._scenario.runtime.tick_s) > snapshot_s:
             snapshot_s = t_s  # too late for that snapshot: use the newest states
         known = KnownRoad(
@@ -229,6 +233,12 @@ class RollingOperation:
             open_road,
         )
         yield Compute(job, partial(_without_deadline, plan))
+
+    def _is_mover_unheard(self, slot: int) -> bool:
+        """Return whether a vehicle that moves in a slot has not been heard since the slot began."""
+        begun_s, states = slot * self._slot_s - 1e-6, self.observed.states
+        movers = (name for each in self._for_slot(slot) for name in each.moves)
+        return any(name in states and states[name].t_s < begun_s for name in movers)
 
     def finish(self, computed: Computed, t_s: float, now_s: float) -> Iterator[LogEntry]:
         """Begin ballots for the first moves of the plan requested last; ignore other results."""

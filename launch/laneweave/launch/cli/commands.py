@@ -79,6 +79,11 @@ COMMANDS = {
         "sweep",
         "Run methods x volumes x seeds in parallel, in virtual time; skip finished runs.",
     ),
+    "tune": CommandEntry(
+        "tune_command",
+        "tune",
+        "Find a method's best settings for a road by random search, in virtual time.",
+    ),
     "report": CommandEntry(
         "study_commands",
         "report",

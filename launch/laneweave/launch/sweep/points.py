@@ -98,7 +98,7 @@ def plan_points(
             try:
                 scenario = with_volume(labelled(label).settings(base), volume)
                 check_moves(scenario)
-                _check_plug_ins(scenario, labelled(label).method)
+                check_plug_ins(scenario, labelled(label).method)
             except BadInputError as error:
                 field = f"{error.field} ({label})"
                 raise BadInputError(field, error.value, error.allowed) from error
@@ -115,7 +115,7 @@ def plan_points(
     )
 
 
-def _check_plug_ins(scenario: Scenario, method: str) -> None:
+def check_plug_ins(scenario: Scenario, method: str) -> None:
     """Check that the plug-in of a method or planner exists, and supports the scenario.
 
     Raises:

@@ -19,6 +19,7 @@ from laneweave.coordinator.rolling.checked_planner import checked, stream_planne
 from laneweave.coordinator.rolling.known_road import LOOKAHEAD_M, MARGIN_COLUMNS
 from laneweave.coordinator.rolling.operation import (
     AGAIN_S,
+    HEAR_S,
     LISTEN_S,
     MAX_DELAY_S,
     RollingOperation,
@@ -864,10 +865,37 @@ def test_a_ballot_that_the_next_plan_ends_is_noted() -> None:
     desk.hear(*(replace(shown(name, desk.transfer.ballot), t_s=BEGUN_S + 1.0) for name in (A, B)))
     assert desk.transfer.plan is not None
     accepted = changed(shown(A, desk.transfer.ballot, accepted=True), t_s=BEGUN_S + 1.1)
-    desk.hear(accepted)
+    desk.hear(accepted, replace(accepted, t_s=BEGUN_S + SLOT_S))
     notes = desk.think(LOOK_S + SLOT_S)
     assert [note.kind for note in notes] == ["handover-given-up", "stream-planned"]
     assert notes[0].data["unanswered"] == [B]
+
+
+def test_a_plan_waits_for_vehicles_that_should_move_now_and_are_not_heard() -> None:
+    """From the cell that one has left, its path and those through its cells would be void."""
+    desk = bench(A, B, C, ways={A: ((0, 0), (0, 1))})
+    desk.think()
+    ballot = desk.transfer.ballot
+    desk.hear(*(replace(shown(name, ballot), t_s=BEGUN_S + 1.0) for name in (A, B)))
+    desk.hear(*(changed(shown(name, ballot, accepted=True), t_s=BEGUN_S + 1.1) for name in (A, B)))
+    assert desk.transfer.phase is BallotPhase.IN_FORCE
+    look_s = LOOK_S + SLOT_S
+    assert desk.order(look_s) is None
+    assert desk.order(look_s + HEAR_S - 0.2) is None
+    moving = changed(shown(A, ballot, accepted=True), t_s=BEGUN_S + SLOT_S, hold_cell=(0, 1))
+    desk.hear(replace(moving, moving=True))
+    call = desk.call(look_s + HEAR_S - 0.2)
+    assert call.vehicles[A].cell == (0, 1)  # B and C, which do not move, need not be heard
+
+
+def test_a_plan_does_not_wait_for_ever_for_a_vehicle_that_is_not_heard() -> None:
+    desk = bench(A, B, ways={A: ((0, 0), (0, 1))})
+    desk.think()
+    ballot = desk.transfer.ballot
+    desk.hear(*(replace(shown(name, ballot), t_s=BEGUN_S + 1.0) for name in (A, B)))
+    desk.hear(*(changed(shown(name, ballot, accepted=True), t_s=BEGUN_S + 1.1) for name in (A, B)))
+    assert desk.order(LOOK_S + SLOT_S + HEAR_S - 0.2) is None
+    assert desk.order(LOOK_S + SLOT_S + HEAR_S) is not None
 
 
 # --- the census -------------------------------------------------------------------------------
