@@ -352,14 +352,17 @@ class FormationPlanner:
         others, scenario = self._neighbouring_plans(plan), self._scenario
         if not formation.sorts:
             end_s = stage_end_s(formation.numbers, formation.stage, scenario)
-            return paced(plan, others, plan.t0_s, end_s, scenario)
-        stage = formation.stage
-        moved = {cell for moves in plan.moves.values() for _, *each in moves for cell in each}
-        if stage.is_last or not moved:
-            moved = {*cells, *plan.territory}
-        end_s = moves_end_s(moved, formation.numbers, stage, scenario)
+            return paced(plan, others, plan.t0_s, lambda _: end_s, scenario)
+        stage, numbers = formation.stage, formation.numbers
         not_before_s = max(settled_s(cells, scenario), t_s + START_MARGIN_S)
-        return paced(plan, others, not_before_s, end_s, scenario, stage.from_m)
+        return paced(
+            plan,
+            others,
+            not_before_s,
+            lambda moved: moves_end_s(moved, numbers, stage, scenario),
+            scenario,
+            stage.from_m,
+        )
 
     def _neighbouring_plans(self, plan: Plan) -> list[Plan]:
         """Return the neighbours' plans that this leader has made and that may be executed."""

@@ -1,10 +1,10 @@
 """Timing of a plan: start, slot length, pauses for neighbouring formations.
 
 When sorting, vehicles change lanes in S3 only (paper, Section 5.2.1), or in a later stage of the
-road (`stages`). If the scenario does not fix T_F, a plan gets the longest slots with which it ends
-in time, and begins as early as possible without any lane change before the stage. Before the rear
-of the formation is in the stage, vehicles may already move along the road, and those in it may
-change lanes.
+road (`stages`). If the scenario does not fix T_F, a plan gets the longest slots with which each of
+its moves ends in time, and begins as early as possible without any lane change before the stage.
+Before the rear of the formation is in the stage, vehicles may already move along the road, and
+those in it may change lanes; when its front leaves the stage, those behind may still move.
 
 Plans stay in the blocks of their formations, so their footprints never intersect. But two moves
 towards each other across the border between formations (conflict kind `closing`) would trigger the
@@ -14,12 +14,13 @@ avoid such moves.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 
 from msgspec.structs import replace
 
 from laneweave.coordinator.formations.roster import on_tick, start_time_s
 from laneweave.coordinator.planning.conflict_kinds import ConflictModel, Move
+from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.plan_execution import TIME_TOLERANCE_S
 from laneweave.protocol.wire.messages import Plan
@@ -49,7 +50,7 @@ def paced(
     plan: Plan,
     others: Sequence[Plan],
     not_before_s: float,
-    end_s: float,
+    end_s: Callable[[Collection[Cell]], float],
     scenario: Scenario,
     from_m: float | None = None,
 ) -> Plan:
@@ -62,13 +63,21 @@ def paced(
             ramps have settled.
         others: plans of neighbouring formations; not changed.
         not_before_s: earliest start (road time).
-        end_s: road time by which the plan should be complete.
+        end_s: returns the road time by which a move between some cells should be complete.
         scenario: road, lattice, T_F.
         from_m: position from which vehicles may change lanes; None: the start of S3.
     """
     slots_s, slack_s = scenario.timing.slots_s[::-1], scenario.formation.slack_s
     comfortable = [slot_s for slot_s in slots_s if slot_s >= scenario.timing.comfortable_cycle_s]
     best = plan
+
+    def in_time(one: Plan, reserve_s: float = 0.0) -> bool:
+        return all(
+            one.t0_s + (1 + step) * one.slot_s <= end_s(cells) - reserve_s + TIME_TOLERANCE_S
+            for moves in one.moves.values()
+            for step, *cells in moves
+        )
+
     # Prefer a smaller reserve to shorter slots.
     for slot_s, reserve_s in (
         *((slot_s, RESERVE_S) for slot_s in comfortable),
@@ -77,9 +86,8 @@ def paced(
         t0_s = plan.t0_s
         if len(slots_s) > 1:
             t0_s = _start_s(plan, slot_s, not_before_s, scenario, from_m)
-        max_steps = max(0, int((end_s - t0_s) / slot_s))
-        best = with_pauses(replace(plan, t0_s=t0_s, slot_s=slot_s), others, slack_s, max_steps)
-        if t0_s + steps_of(best) * slot_s <= end_s - reserve_s:
+        best = with_pauses(replace(plan, t0_s=t0_s, slot_s=slot_s), others, slack_s, in_time)
+        if in_time(best, reserve_s):
             return best
     return best
 
@@ -97,7 +105,9 @@ def _start_s(
     return min(plan.t0_s, on_tick(max([not_before_s, *in_time]), scenario))
 
 
-def with_pauses(plan: Plan, others: Iterable[Plan], slack_s: float, max_steps: int) -> Plan:
+def with_pauses(
+    plan: Plan, others: Iterable[Plan], slack_s: float, in_time: Callable[[Plan], bool]
+) -> Plan:
     """Return a plan with pauses, so that no move has a `closing` conflict with another plan.
 
     All vehicles pause together, so the order of moves does not change.
@@ -106,8 +116,8 @@ def with_pauses(plan: Plan, others: Iterable[Plan], slack_s: float, max_steps: i
         plan: the new plan.
         others: plans of neighbouring formations; not changed.
         slack_s: difference between the length of a slot and the duration of a move [s].
-        max_steps: maximum number of slots. Remaining conflicts are left to the emergency brake,
-            because a late vehicle is better than one in a wrong lane.
+        in_time: returns whether a plan ends in time. Conflicts that remain are left to the
+            emergency brake, because a late vehicle is better than one in a wrong lane.
     """
     theirs = [
         (other.t0_s + step * other.slot_s, other.slot_s - slack_s, (origin, target))
@@ -125,17 +135,17 @@ def with_pauses(plan: Plan, others: Iterable[Plan], slack_s: float, max_steps: i
             for other_s, other_lasts_s, other in theirs
         )
 
-    while steps_of(plan) < max_steps:
+    while True:
         closing = [
             step
             for moves in plan.moves.values()
             for step, origin, target in moves
             if closes_up(step, (origin, target))
         ]
-        if not closing:
-            break
-        plan = _paused(plan, min(closing))
-    return plan
+        paused = _paused(plan, min(closing)) if closing else plan
+        if paused is plan or not in_time(paused):
+            return plan
+        plan = paused
 
 
 def _paused(plan: Plan, pause: int) -> Plan:

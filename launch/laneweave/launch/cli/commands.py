@@ -84,6 +84,11 @@ COMMANDS = {
         "tune",
         "Find a method's best settings for a road by random search, in virtual time.",
     ),
+    "sensitivity": CommandEntry(
+        "sensitivity_command",
+        "sensitivity",
+        "Change one setting at a time, in virtual time, and write a page with a tornado chart.",
+    ),
     "report": CommandEntry(
         "study_commands",
         "report",

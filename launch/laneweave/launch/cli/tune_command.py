@@ -16,8 +16,8 @@ from rich.table import Table
 from laneweave.launch.cli.options import Duration, Jobs, NoProgress, check_jobs, parse_seeds
 from laneweave.launch.run.run_folder import timestamped_folder
 from laneweave.launch.run_methods import METHODS
-from laneweave.launch.sweep.tuning import DEFAULT_SET, Score
-from laneweave.launch.sweep.variants import Variant
+from laneweave.launch.studies.tuning import DEFAULT_SET, Score
+from laneweave.launch.studies.variants import Variant
 from laneweave.protocol.config.scenario_files import load_scenario
 from laneweave.protocol.errors import CommandFailedError
 from laneweave.protocol.files import write_atomically
@@ -77,12 +77,12 @@ def tune(
 ) -> None:
     """Find a method's best settings for a road by random search, in virtual time."""
     from laneweave.launch.run_methods import parse_methods
+    from laneweave.launch.studies.tuning import draw_sets, margins_of, score_of
+    from laneweave.launch.studies.variants import check_recorded, runs_by_label, variant_points
     from laneweave.launch.sweep.execution import run_locally
     from laneweave.launch.sweep.folder import SweepFolder
     from laneweave.launch.sweep.points import sweep_volumes, volume_text
     from laneweave.launch.sweep.sweep import run_sweep
-    from laneweave.launch.sweep.tuning import draw_sets, margins_of, score_of
-    from laneweave.launch.sweep.variants import check_recorded, runs_by_label, variant_points
     from laneweave.protocol.errors import BadInputError
 
     base = load_scenario(scenario, demand__duration_s=duration)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 import pytest
 from msgspec.structs import replace
 
@@ -12,7 +14,7 @@ from laneweave.protocol.lattice import Cell, PlannedMove
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.formation_table import FormationSettings
 from laneweave.protocol.wire.messages import Plan
-from support.states import A, make_plan
+from support.states import A, B, make_plan
 
 SCENARIO = Scenario()
 LATTICE = SCENARIO.lattice
@@ -29,7 +31,7 @@ def climbing(steps: int) -> Plan:
 
 def paced(plan: Plan, scenario: Scenario = SCENARIO) -> Plan:
     end_s = plan.t0_s + left_s(plan)
-    return pacing.paced(plan, [], plan.t0_s, end_s, scenario)
+    return pacing.paced(plan, [], plan.t0_s, lambda _: end_s, scenario)
 
 
 def left_s(plan: Plan) -> float:
@@ -71,7 +73,10 @@ def test_a_plan_begins_before_its_rear_is_in_s3_unless_a_lane_change_does() -> N
         t0_s=start_time_s([(-3, 0)], 0.0, SCENARIO),
         territory=((-3, 0), (-2, 0), (-2, 1)),
     )
-    end_s = exit_time_s(plan.territory, SCENARIO)
+
+    def end_s(cells: Collection[Cell]) -> float:
+        return exit_time_s(cells, SCENARIO)
+
     early = pacing.paced(plan, [], 0.0, end_s, SCENARIO)
     changes_s = early.t0_s + early.slot_s
     assert early.t0_s < plan.t0_s
@@ -79,6 +84,25 @@ def test_a_plan_begins_before_its_rear_is_in_s3_unless_a_lane_change_does() -> N
     assert pacing.paced(plan, [], plan.t0_s - 1.0, end_s, SCENARIO).t0_s == pytest.approx(
         plan.t0_s - 1.0
     )
+
+
+def test_each_move_ends_before_its_vehicle_leaves() -> None:
+    """Slots are longer than if all moves had to end before the front of the formation leaves."""
+    plan = replace(
+        climbing(6),
+        start_cells={A: (FRONT, 0), B: (-6, 0)},
+        moves=climbing(6).moves
+        | {B: tuple((step, (-6, step % 2), (-6, 1 - step % 2)) for step in range(8))},
+    )
+
+    def end_s(cells: Collection[Cell]) -> float:
+        return exit_time_s(cells, SCENARIO)
+
+    chosen = pacing.paced(plan, [], plan.t0_s, end_s, SCENARIO)
+    together = pacing.paced(plan, [], plan.t0_s, lambda _: end_s([(FRONT, 0)]), SCENARIO)
+    assert chosen.slot_s > together.slot_s
+    for steps, column in ((6, FRONT), (8, -6)):
+        assert chosen.t0_s + steps * chosen.slot_s <= end_s([(column, 0)]) - MIN_RESERVE_S
 
 
 def test_a_given_cycle_leaves_no_choice() -> None:
@@ -104,5 +128,5 @@ def test_neighbours_with_slots_of_other_lengths_are_kept_apart(
     mine = replace(climbing(1), moves={A: ((0, (-5, 1), (-4, 1)),)}, slot_s=slot_s)
     theirs = replace(mine, moves={A: ((0, (-2, 1), (-3, 1)),)}, slot_s=their_slot_s)
     late = replace(mine, t0_s=mine.t0_s + late_s)
-    paused = with_pauses(late, [theirs], SCENARIO.formation.slack_s, 9)
+    paused = with_pauses(late, [theirs], SCENARIO.formation.slack_s, lambda _: True)
     assert (steps_of(paused) - 1 > 0) is bool(pauses)
