@@ -26,6 +26,7 @@ SINGLE_ROLE = {
     "lc2013": "reference methods run in one process",
     "network": "each process has its own links and deadlines",
     "security": "each process has its own files; the router enforces the rights",
+    "radio": "each receiver loses messages by itself; safety does not depend on it",
     "service": "of each coordinator",
     "observation": "of each process",
     "sumo": "of the bridge",

@@ -1,0 +1,145 @@
+"""Sensitivity of results to single settings: factors, their order, the page."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from attrs import evolve
+
+from laneweave.launch.recordings.runs import Run
+from laneweave.launch.studies.sensitivity import (
+    Factor,
+    Level,
+    Result,
+    by_effect,
+    factors_of,
+    result_of,
+)
+from laneweave.launch.studies.sensitivity_page import draw_tornado, results_table
+from laneweave.launch.studies.variants import Variant
+from laneweave.protocol.config.scenario_files import load_scenario, scenario_of
+from laneweave.protocol.errors import BadInputError
+from laneweave.protocol.scenario.radio_table import C_V2X, DSRC
+from support.commands import Here
+from support.summaries import make_summary
+
+BASE = load_scenario(None)
+
+
+def names(method: str, **overrides: object) -> list[str]:
+    return [factor.name for factor in factors_of(method, load_scenario(None, **overrides))]
+
+
+def level(factor: str, end: str, **overrides: object) -> Level:
+    (found,) = (
+        one
+        for one in factors_of("formation", load_scenario(None, **overrides))
+        if one.name == factor
+    )
+    chosen = found.low if end == "low" else found.high
+    assert chosen is not None
+    return chosen
+
+
+def result(delay_s: float | None) -> Result:
+    return Result(2, delay_s, 100.0, 3.2, 9.0, 130.0, 0, 0)
+
+
+def test_all_factors_of_formations() -> None:
+    assert names("formation") == [
+        "preferred lanes", "volume", "length of S3", "v_F", "T_F", "N", "measurement errors",
+        "delay", "loss",
+    ]  # fmt: skip
+
+
+def test_factors_without_effect_are_left_out() -> None:
+    assert names("lc2013") == ["preferred lanes", "volume", "length of S3", "v_F"]
+    assert "N" not in names("formation", formation__operation="rolling")
+
+
+def test_levels_change_one_setting() -> None:
+    assert level("volume", "high").variant.settings == {"demand.volume_veh_per_lane_h": 1200.0}
+    assert level("v_F", "low").variant.settings == {"formation.speed_mps": 12.0}
+    assert level("N", "low").variant.settings == {"formation.max_vehicles": 4}
+    shares = level("preferred lanes", "low").variant.settings["demand.lane_shares"]
+    assert shares == pytest.approx([0.6, 0.2, 0.2])
+    errors = level("measurement errors", "high").variant.settings
+    assert errors["sensing.gap_noise_m"] == 4.0 * BASE.sensing.gap_noise_m
+    lossy = level("loss", "high").variant.scenario("formation", BASE).radio
+    assert (lossy.technology, lossy.cellular_loss, lossy.burst_share) == (C_V2X, 0.3, 0.3)
+    kept = level("delay", "high", radio__technology=DSRC).variant.settings
+    assert kept == {"radio.cellular_delay_s": 0.5}
+
+
+def test_ends_that_are_impossible_are_named() -> None:
+    short = scenario_of({"road": {"s3_m": 160.0}})
+    found = {factor.name: factor for factor in factors_of("formation", short)}["length of S3"]
+    assert found.low is None
+    assert found.high is not None
+    (reason,) = found.refused
+    assert reason.startswith("length of S3 106.7 m: road.s3_m: got 106.7")
+
+
+def test_results_of_runs() -> None:
+    def run_with(mean_s: float | None, ttc_s: float, left: int) -> Run:
+        made = make_summary()
+        summary = evolve(
+            made,
+            travel_time_s=evolve(made.travel_time_s, mean=mean_s),
+            safety=evolve(made.safety, min_ttc_s=ttc_s),
+            vehicles=evolve(made.vehicles, left=left),
+        )
+        return Run(Path("x"), "base", "formation", BASE, summary)
+
+    runs = [run_with(70.0, 3.1, 100), run_with(72.0, 2.9, 98), Run(Path("x"), "b", "f", BASE, None)]
+    found = result_of(runs)
+    assert found.runs == 2
+    assert found.delay_s == pytest.approx(71.0 - 1000.0 / 15.0)
+    assert (found.min_ttc_s, found.not_left, found.co2_g_per_km) == (2.9, 2, None)
+    assert result_of([]) == Result(0, None, None, None, None, None, 0, 0)
+
+
+def test_factors_with_larger_effects_come_first_and_bars_reach_their_ends(tmp_path: Path) -> None:
+    def factor(name: str, *ends: str | None) -> Factor:
+        low, high = (None if one is None else Level(one, Variant(one, {})) for one in ends)
+        return Factor(name, low, high)
+
+    factors = [factor("small", "a", "b"), factor("large", None, "c"), factor("unknown", "d", None)]
+    results = {"a": result(0.9), "b": result(1.2), "c": result(3.0), "d": result(None)}
+    ordered = by_effect(factors, results, result(1.0))
+    assert [one.name for one in ordered] == ["large", "small", "unknown"]
+    draw_tornado(ordered, results, result(1.0), tmp_path / "chart.png")
+    assert (tmp_path / "chart.png").read_bytes().startswith(b"\x89PNG")
+    table = results_table(ordered, results, result(1.0))
+    assert [row[:3] for row in table.rows] == [
+        ("base", "", "1.00"), ("large", "c", "3.00"), ("small", "a", "0.90"),
+        ("small", "b", "1.20"), ("unknown", "d", "-"),
+    ]  # fmt: skip
+
+
+def test_the_command_writes_a_page_and_continues(laneweave: Here, tmp_path: Path) -> None:
+    command = (
+        "sensitivity", "--method", "rule", "--volume", "900", "--seeds", "1:2", "--duration", "70",
+        "--out", tmp_path / "study",
+    )  # fmt: skip
+    status, out, errors = laneweave(*command)
+    assert status == 0, errors
+    assert out.endswith("report.html: written\n")
+    page = (tmp_path / "study" / "report.html").read_text(encoding="utf-8")
+    assert "Mean delay with one setting changed at a time" in page
+    assert "length of S3" in page
+    found = json.loads((tmp_path / "study" / "sensitivity.json").read_text(encoding="utf-8"))
+    volumes = next(one for one in found["factors"] if one["name"] == "volume")["levels"]
+    assert [one["text"] for one in volumes] == ["720 veh/(lane h)", "1080 veh/(lane h)"]
+    assert volumes[0]["delay_s"] <= volumes[1]["delay_s"]
+    assert found["base"]["runs"] == 1
+    _, _, errors = laneweave(*command)
+    assert "runs were already finished" in errors[0]
+
+
+def test_one_method_only(laneweave: Here) -> None:
+    assert laneweave.refused("sensitivity", "--method", "rule,lc2013").startswith("--method")
+    with pytest.raises(BadInputError, match="volume"):
+        load_scenario(None, demand__volume_veh_per_lane_h=-1.0)
