@@ -41,6 +41,14 @@ Jobs = Annotated[
     int | None, typer.Option("--jobs", metavar="N", help="Processes; default: one per core.")
 ]
 NoProgress = Annotated[bool, typer.Option("--no-progress", help="Show no progress bar.")]
+ContinuedFolder = Annotated[
+    Path | None,
+    typer.Option(
+        "--out",
+        metavar="DIR",
+        help="Default: a new folder in runs/. What was stopped in an existing one is continued.",
+    ),
+]
 RunFolder = Annotated[
     Path | None, typer.Option("--out", metavar="DIR", help="Default: a new folder in runs/.")
 ]

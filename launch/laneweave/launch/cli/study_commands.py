@@ -11,6 +11,7 @@ import typer
 from rich.console import Console
 
 from laneweave.launch.cli.options import (
+    ContinuedFolder,
     Duration,
     Jobs,
     ScenarioArgument,
@@ -47,14 +48,7 @@ def sweep(
     seeds: Seeds = "1:4",
     duration: Duration = None,
     jobs: Jobs = None,
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            "--out",
-            metavar="DIR",
-            help="Default: a new folder in runs/. An existing sweep is continued.",
-        ),
-    ] = None,
+    out: ContinuedFolder = None,
     keep_trajectories: Annotated[
         KeepTrajectories, typer.Option("--keep-trajectories", help="Runs to keep them for.")
     ] = KeepTrajectories.first_seed,

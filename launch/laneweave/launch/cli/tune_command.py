@@ -13,13 +13,20 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from laneweave.launch.cli.options import Duration, Jobs, NoProgress, check_jobs, parse_seeds
+from laneweave.launch.cli.options import (
+    ContinuedFolder,
+    Duration,
+    Jobs,
+    NoProgress,
+    check_jobs,
+    parse_seeds,
+)
 from laneweave.launch.run.run_folder import timestamped_folder
 from laneweave.launch.run_methods import METHODS
 from laneweave.launch.studies.tuning import DEFAULT_SET, Score
 from laneweave.launch.studies.variants import Variant
 from laneweave.protocol.config.scenario_files import load_scenario
-from laneweave.protocol.errors import CommandFailedError
+from laneweave.protocol.errors import BadInputError, CommandFailedError
 from laneweave.protocol.files import write_atomically
 
 SCHEMA = "laneweave.tuning/1"
@@ -65,25 +72,14 @@ def tune(
     ] = "1001:1003",
     duration: Duration = None,
     jobs: Jobs = None,
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            "--out",
-            metavar="DIR",
-            help="Default: a new folder in runs/. An existing search is continued.",
-        ),
-    ] = None,
+    out: ContinuedFolder = None,
     no_progress: NoProgress = False,
 ) -> None:
     """Find a method's best settings for a road by random search, in virtual time."""
     from laneweave.launch.run_methods import parse_methods
     from laneweave.launch.studies.tuning import draw_sets, margins_of, score_of
-    from laneweave.launch.studies.variants import check_recorded, runs_by_label, variant_points
-    from laneweave.launch.sweep.execution import run_locally
-    from laneweave.launch.sweep.folder import SweepFolder
+    from laneweave.launch.studies.variants import finished_runs, variant_points
     from laneweave.launch.sweep.points import sweep_volumes, volume_text
-    from laneweave.launch.sweep.sweep import run_sweep
-    from laneweave.protocol.errors import BadInputError
 
     base = load_scenario(scenario, demand__duration_s=duration)
     try:
@@ -96,16 +92,8 @@ def tune(
     sets = draw_sets(method, margins, base, budget)
     used = parse_seeds(seeds)
     points = variant_points(sets, method, base, chosen, used)
-    workers = check_jobs(jobs)
-    with SweepFolder(out or timestamped_folder("tune")) as folder:
-        check_recorded(folder, points)
-        run_sweep(
-            points,
-            folder,
-            lambda waiting, unfinished: run_locally(waiting, unfinished, workers),
-            show=not no_progress,
-        )
-        runs = runs_by_label(folder, points)
+    folder = out or timestamped_folder("tune")
+    with finished_runs(points, folder, check_jobs(jobs), show=not no_progress) as runs:
         wanted = len(chosen) * len(used)
         scores = sorted(
             (score_of(one.label, runs[one.label], wanted) for one in sets),
@@ -120,10 +108,10 @@ def tune(
             "margins": {name: [one.low, one.high] for name, one in margins.items()},
             "sets": [_record(score, settings[score.label]) for score in scores],
         }
-        write_atomically(folder.out / TUNING_FILE, json.dumps(result, indent=1) + "\n")
-        _print(Console(), folder.out, scores, settings)
+        write_atomically(folder / TUNING_FILE, json.dumps(result, indent=1) + "\n")
+        _print(Console(), folder, scores, settings)
     if math.isinf(scores[0].score_s):
-        raise CommandFailedError(f"no set let all vehicles leave: see {folder.out}")
+        raise CommandFailedError(f"no set let all vehicles leave: see {folder}")
 
 
 def _record(score: Score, variant: Variant) -> dict[str, object]:

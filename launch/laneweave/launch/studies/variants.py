@@ -5,14 +5,19 @@ A variant has a label of its own, as methods do; `tuning` and `sensitivity` comp
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
 
 from attrs import evolve, frozen
 
 from laneweave.launch.recordings.runs import Run
 from laneweave.launch.run_methods import LabelledMethod, labelled
+from laneweave.launch.sweep.execution import run_locally
 from laneweave.launch.sweep.folder import SweepFolder
 from laneweave.launch.sweep.points import Point, check_plug_ins, with_volume
+from laneweave.launch.sweep.sweep import run_sweep
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.fields import Scenario
 
@@ -65,24 +70,30 @@ def variant_points(
     )
 
 
-def check_recorded(folder: SweepFolder, points: Iterable[Point]) -> None:
-    """Check that the finished points of a folder have the same settings as these.
+@contextmanager
+def finished_runs(
+    points: Sequence[Point], out: Path, workers: int, *, show: bool
+) -> Iterator[dict[str, list[Run]]]:
+    """Run the points that are not finished; yield the runs by label, in the order of the points.
+
+    Args:
+        points: points of variants.
+        out: folder of a sweep, which is locked in the context.
+        workers: maximum number of simultaneous processes.
+        show: whether to show progress.
 
     Raises:
-        BadInputError: some have not.
+        BadInputError: the folder has runs with other settings, or is not that of a sweep.
+        CommandFailedError: files or processes cannot be created.
     """
-    for point in points:
-        run = folder.runs.get(point.name)
-        if run is not None and (run.method, run.scenario) != (point.method, point.scenario):
-            allowed = f"a new folder: {run.folder} has other settings"
-            raise BadInputError("--out", str(folder.out), allowed)
-
-
-def runs_by_label(folder: SweepFolder, points: Iterable[Point]) -> dict[str, list[Run]]:
-    """Return the finished runs of points, by label in the order of the points."""
-    found: dict[str, list[Run]] = {}
-    for point in points:
-        runs = found.setdefault(point.label, [])
-        if point.name in folder.runs:
-            runs.append(folder.runs[point.name])
-    return found
+    with SweepFolder(out) as folder:
+        for point in points:
+            run = folder.runs.get(point.name)
+            if run is not None and (run.method, run.scenario) != (point.method, point.scenario):
+                allowed = f"a new folder: {run.folder} has other settings"
+                raise BadInputError("--out", str(out), allowed)
+        run_sweep(points, folder, partial(run_locally, workers=workers), show=show)
+        found: dict[str, list[Run]] = {point.label: [] for point in points}
+        for point in points:
+            found[point.label].append(folder.runs[point.name])
+        yield found
