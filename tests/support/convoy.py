@@ -38,7 +38,7 @@ COORDINATORS = (
     Heartbeat(Name("c2"), 18, 3, leading=False, plans=0),
     Heartbeat(Name("c3"), 19, 3, leading=False, plans=0),
 )
-ROLLING = Scenario(formation=FormationSettings(operation="rolling", cycle_s=6.0))
+ROLLING = Scenario(formation=FormationSettings(operation="rolling"))
 
 
 @frozen

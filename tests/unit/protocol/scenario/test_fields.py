@@ -114,14 +114,11 @@ def test_slots_are_from_four_to_seven_seconds_unless_they_are_given() -> None:
     slower = parse_scenario({"formation": {"cycle_s": 5.0, "move_s": 4.0}})
     assert slower.timing.move_durations == {40}
     rolling = parse_scenario({"formation": {"operation": "rolling"}})
-    assert (rolling.timing.slots_s, rolling.timing.horizon_ticks) == ((7.0,), 70)
-    for volume, slot_s in ((1800.0, 7.0), (1801.0, 6.0), (2200.0, 6.0), (2201.0, 4.0)):
-        tables = {"operation": "rolling"}, {"volume_veh_per_lane_h": volume}
-        dense = parse_scenario(dict(zip(("formation", "demand"), tables, strict=True)))
-        assert (dense.timing.slots_s, dense.timing.horizon_ticks) == ((slot_s,), 10 * slot_s)
-    closed = {"closures": [{"lane": 0, "from_m": 900.0}]}
-    narrow = parse_scenario({"formation": {"operation": "rolling"}, "road": closed})
-    assert narrow.timing.slots_s == (6.0,)
+    assert (rolling.timing.slots_s, rolling.timing.horizon_ticks) == ((6.0,), 60)
+    dense = parse_scenario(
+        {"formation": {"operation": "rolling"}, "demand": {"volume_veh_per_lane_h": 2201.0}}
+    )
+    assert (dense.timing.slots_s, dense.timing.horizon_ticks) == ((4.0,), 40)
     long = parse_scenario({"tracking": {"horizon_ticks": 80}})
     assert long.timing.horizon_ticks == 80
 
