@@ -1,6 +1,6 @@
 """Run the evaluation and update its pages, docs/EVALUATION_*.md.
 
-    python benchmarks/evaluate.py [--only PART ...] [--labels LABEL ...] [--seeds A:B]
+    python benchmarks/evaluate.py [--only PART ...] [--labels LABEL ...] [--seeds A:B] [--add-seeds]
                 [--budget MINUTES] [--jobs N] [--duration S] [--sweeps DIR ...] [--out DIR]
 
 zenoh      three points of the sweep over Zenoh with a process per vehicle, and simulated
@@ -12,9 +12,10 @@ report     docs/evidence/evaluation.json, figures in docs/images, tables in the 
 faults     benchmarks/resilience.py, over an hour; only on request
 
 Finished parts are kept: the same command continues where it stopped. With --labels the sweep runs
-only these methods, and the report replaces only their rows. With --budget the sweep starts no seed
-that would not finish in time. The exit status is 1 if a run of formation control violates a
-guarantee or a run does not finish.
+only these methods, and the report replaces only their rows; with --add-seeds it keeps those of
+other seeds, so that the seeds of one version may be run on several days. With --budget the sweep
+starts no seed that would not finish in time. The exit status is 1 if a run of formation control
+violates a guarantee or a run does not finish.
 """
 
 from __future__ import annotations
@@ -111,7 +112,7 @@ def run(arguments: argparse.Namespace) -> bool:
             good &= rounds.run(out)
         elif part == "report":
             say("report")
-            refresh(out, arguments.sweeps, labels, DOCS)
+            refresh(out, arguments.sweeps, labels, DOCS, add_seeds=arguments.add_seeds)
             good &= run_script(DOCS / "generate.py")
         elif part == "stability":
             say("stability")
@@ -138,6 +139,9 @@ def main() -> int:
         "--labels", nargs="+", metavar="LABEL", default=LABELS, help=", ".join(LABELS)
     )
     parser.add_argument("--seeds", default=f"{SEEDS[0]}:{SEEDS[-1] + 1}", help="seeds of the sweep")
+    parser.add_argument(
+        "--add-seeds", action="store_true", help="report: keep recorded runs of other seeds"
+    )
     parser.add_argument("--duration", default=f"{DURATION_S:g}", help="duration of arrivals [s]")
     parser.add_argument(
         "--jobs",

@@ -154,7 +154,14 @@ def collect(out: Path, sweeps: Iterable[Path], labels: Collection[str], images: 
     )
 
 
-def refresh(out: Path, sweeps: Iterable[Path], labels: Collection[str], docs: Path) -> None:
+def refresh(
+    out: Path,
+    sweeps: Iterable[Path],
+    labels: Collection[str],
+    docs: Path,
+    *,
+    add_seeds: bool = False,
+) -> None:
     """Bring docs/evidence/evaluation.json and the figures up to date.
 
     Parts and labels without runs in the folders keep the recorded values.
@@ -164,6 +171,7 @@ def refresh(out: Path, sweeps: Iterable[Path], labels: Collection[str], docs: Pa
         sweeps: as in `collect`.
         labels: as in `collect`.
         docs: folder of the documents.
+        add_seeds: keep recorded runs of other seeds.
 
     Raises:
         BadInputError, OSError, ValueError, KeyError: as in `collect`.
@@ -171,4 +179,4 @@ def refresh(out: Path, sweeps: Iterable[Path], labels: Collection[str], docs: Pa
     path = docs / "evidence" / "evaluation.json"
     recorded = read_evidence(path)
     new = collect(out, sweeps, labels, docs / "images")
-    write_evidence(recorded.updated_with(new), path)
+    write_evidence(recorded.updated_with(new, add_seeds=add_seeds), path)

@@ -71,10 +71,10 @@ class Evidence:
         """The points by label and volume."""
         return {(row.label, row.volume_veh_per_lane_h): row for row in self.points}
 
-    def updated_with(self, new: Evidence) -> Evidence:
+    def updated_with(self, new: Evidence, *, add_seeds: bool = False) -> Evidence:
         """Return a copy in which the parts of newer evidence replace the present ones.
 
-        Runs replace those of the same labels.
+        Runs replace those of the same labels; with `add_seeds`, only those of the same seeds.
 
         Raises:
             BadInputError: runs of other labels have another setting.
@@ -82,11 +82,16 @@ class Evidence:
         kept = self
         if new.runs:
             labels = {row.label for row in new.runs}
-            others = [row for row in self.runs if row.label not in labels]
+            seeds = {(*row.key, row.seed) for row in new.runs}
+            others = [
+                row
+                for row in self.runs
+                if row.label not in labels or (add_seeds and (*row.key, row.seed) not in seeds)
+            ]
             if others and new.setting != self.setting:
                 names = ", ".join(sorted({row.label for row in others}))
                 raise BadInputError("setting", new.setting, f"{self.setting}, as for {names}")
-            runs = sorted([*others, *new.runs], key=lambda row: (*rank(row.label), *row.key[1:]))
+            runs = sorted([*others, *new.runs], key=_order)
             kept = evolve(kept, setting=new.setting, runs=tuple(runs), pictures=new.pictures)
         return evolve(
             kept,
@@ -94,6 +99,10 @@ class Evidence:
             factors=new.factors or kept.factors,
             costs=new.costs or kept.costs,
         )
+
+
+def _order(row: RunRow) -> tuple[int, str, float, int]:
+    return (*rank(row.label), row.volume_veh_per_lane_h, row.seed)
 
 
 def setting_of(runs: Sequence[Run]) -> Setting:
