@@ -111,8 +111,8 @@ _SUMO_TUNED: Final[dict[str, object]] = {
     "lc2013.cooperative": 0.879,
     "lc2013.assertive": 1.58,
 }
-"""Found by `laneweave tune lc2013 --volumes 1000,1600,2000 --budget 40 --duration 300` on the paper's
-road: of the sets with the shortest travel times, within 0.1 %, the one that brakes least hard."""
+"""Found by `laneweave tune lc2013 --volumes 1000,1600,2000 --duration 300` on the paper's road: of
+the sets with the shortest travel times, within 0.1 %, the one that brakes least hard."""
 _SL2015: Final[dict[str, object]] = {"lc2013.model": "SL2015"}
 
 METHODS: Final[dict[str, LabelledMethod]] = {
