@@ -134,6 +134,8 @@ class Lc2013Settings:
 
     model: str = field(default="LC2013", validator=one_of("LC2013", "SL2015"))
     """SUMO's lane-changing model; with SL2015, vehicles also move within their lanes."""
+    speed_factor: float = field(default=1.0, validator=within(0.5, 2.0))
+    """Desired speed, divided by v_F."""
     headway_s: float = field(default=0.66, validator=within(0.0, 10.0, open_low=True))
     """tau of the car-following model, bumper to bumper."""
     min_gap_m: float = field(default=0.0, validator=within(0.0, 50.0))

@@ -182,6 +182,7 @@ def _driver(settings: Lc2013Settings) -> dict[str, float | str]:
         "tau": settings.headway_s,
         "minGap": settings.min_gap_m,
         "sigma": settings.imperfection,
+        "speedFactor": settings.speed_factor,
         "accel": settings.accel_mps2,
         "decel": settings.decel_mps2,
         "lcStrategic": settings.strategic,

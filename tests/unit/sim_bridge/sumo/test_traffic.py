@@ -61,6 +61,7 @@ def test_drivers_are_as_the_scenario_says(tmp_path: Path) -> None:
     table = {
         "model": "SL2015",
         "imperfection": 0.5,
+        "speed_factor": 1.1,
         "accel_mps2": 2.6,
         "decel_mps2": 4.5,
         "strategic": 10.0,
@@ -72,6 +73,7 @@ def test_drivers_are_as_the_scenario_says(tmp_path: Path) -> None:
     assert kind["laneChangeModel"] == "SL2015"
     names = [
         "sigma",
+        "speedFactor",
         "accel",
         "decel",
         "emergencyDecel",
@@ -79,7 +81,7 @@ def test_drivers_are_as_the_scenario_says(tmp_path: Path) -> None:
         "lcCooperative",
         "lcAssertive",
     ]
-    assert [float(kind[name]) for name in names] == [0.5, 2.6, 4.5, 10.0, 10.0, 0.5, 2.0]
+    assert [float(kind[name]) for name in names] == [0.5, 1.1, 2.6, 4.5, 10.0, 10.0, 0.5, 2.0]
     assert "--lateral-resolution" in options
     assert "--lanechange.duration" not in options
 
