@@ -49,7 +49,8 @@ def sensitivity(
     from laneweave.launch.run_methods import parse_methods
     from laneweave.launch.studies.sensitivity import BASE, by_effect, factors_of, result_of
     from laneweave.launch.studies.sensitivity_page import write_sensitivity
-    from laneweave.launch.studies.variants import Variant, finished_runs, variant_points
+    from laneweave.launch.studies.study_runs import finished_runs
+    from laneweave.launch.sweep.points import Variant, variant_points
 
     base = load_scenario(
         scenario, demand__duration_s=duration, demand__volume_veh_per_lane_h=volume

@@ -24,7 +24,7 @@ from laneweave.launch.cli.options import (
 from laneweave.launch.run.run_folder import timestamped_folder
 from laneweave.launch.run_methods import METHODS
 from laneweave.launch.studies.tuning import DEFAULT_SET, Score
-from laneweave.launch.studies.variants import Variant
+from laneweave.launch.sweep.points import Variant
 from laneweave.protocol.config.scenario_files import load_scenario
 from laneweave.protocol.errors import BadInputError, CommandFailedError
 from laneweave.protocol.files import write_atomically
@@ -77,9 +77,9 @@ def tune(
 ) -> None:
     """Find a method's best settings for a road by random search, in virtual time."""
     from laneweave.launch.run_methods import parse_methods
+    from laneweave.launch.studies.study_runs import finished_runs
     from laneweave.launch.studies.tuning import draw_sets, margins_of, score_of
-    from laneweave.launch.studies.variants import finished_runs, variant_points
-    from laneweave.launch.sweep.points import sweep_volumes, volume_text
+    from laneweave.launch.sweep.points import sweep_volumes, variant_points, volume_text
 
     base = load_scenario(scenario, demand__duration_s=duration)
     try:

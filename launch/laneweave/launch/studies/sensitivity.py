@@ -10,7 +10,7 @@ from attrs import frozen
 
 from laneweave.launch.recordings.runs import Run
 from laneweave.launch.run_methods import affects, labelled
-from laneweave.launch.studies.variants import Variant
+from laneweave.launch.sweep.points import Variant
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.radio_table import C_V2X

@@ -19,7 +19,7 @@ from attrs import frozen
 
 from laneweave.launch.recordings.runs import Run
 from laneweave.launch.run_methods import LC2013, RULE, labelled
-from laneweave.launch.studies.variants import Variant
+from laneweave.launch.sweep.points import Variant
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.fields import Scenario
 

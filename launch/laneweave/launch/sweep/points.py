@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 from attrs import evolve, frozen
 
@@ -13,6 +13,7 @@ from laneweave.launch.run_methods import (
     REFERENCE_METHODS,
     SUMO_HAS_DEMAND,
     KeepTrajectories,
+    LabelledMethod,
     labelled,
     reference_method,
 )
@@ -110,6 +111,54 @@ def plan_points(
     }[keep]
     return tuple(
         Point(label, labelled(label).method, evolve(scenario, seed=seed), seed in kept)
+        for seed in seeds
+        for label, scenario in settings
+    )
+
+
+@frozen
+class Variant:
+    """A method with settings that replace some of its own."""
+
+    label: str
+    settings: Mapping[str, object]
+    """Values by `table.field`."""
+
+    def scenario(self, method: str, base: Scenario) -> Scenario:
+        """Return the scenario of the labelled method `method` with these settings.
+
+        Raises:
+            BadInputError: the settings contradict each other or the scenario.
+        """
+        known = labelled(method)
+        return LabelledMethod(known.method, {**known.overrides, **self.settings}).settings(base)
+
+
+def variant_points(
+    variants: Iterable[Variant],
+    method: str,
+    base: Scenario,
+    volumes: Sequence[float],
+    seeds: Sequence[int],
+) -> tuple[Point, ...]:
+    """Return the points of variants x volumes x seeds, seed by seed.
+
+    Raises:
+        BadInputError: the settings of a variant contradict each other or the scenario.
+    """
+    kind = labelled(method).method
+    settings: list[tuple[str, Scenario]] = []
+    for variant in variants:
+        try:
+            for volume in volumes:
+                scenario = variant.scenario(method, with_volume(base, volume))
+                check_plug_ins(scenario, kind)
+                settings.append((variant.label, scenario))
+        except BadInputError as error:
+            field = f"{error.field} ({variant.label})"
+            raise BadInputError(field, error.value, error.allowed) from error
+    return tuple(
+        Point(label, kind, evolve(scenario, seed=seed), keep_trajectories=False)
         for seed in seeds
         for label, scenario in settings
     )

@@ -18,7 +18,7 @@ from laneweave.launch.studies.sensitivity import (
     result_of,
 )
 from laneweave.launch.studies.sensitivity_page import draw_tornado, results_table
-from laneweave.launch.studies.variants import Variant
+from laneweave.launch.sweep.points import Variant
 from laneweave.protocol.config.scenario_files import load_scenario, scenario_of
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.radio_table import C_V2X, DSRC
