@@ -75,8 +75,8 @@ def _points() -> Iterator[Point]:
         for technology in (C_V2X, DSRC):
             yield Point(operation, technology, {"power_dbm": POWER_DBM}, seeds=3)
             for power_dbm, others in (
-                *((POWER_DBM, others) for others in (200.0, 400.0)),
-                *((power_dbm, 0.0) for power_dbm in (10.0, 0.0, -5.0, -10.0)),
+                (POWER_DBM, 400.0),
+                *((power_dbm, 0.0) for power_dbm in (0.0, -5.0, -10.0)),
                 (0.0, 400.0),
             ):
                 settings = {"power_dbm": power_dbm, "other_senders_per_km": others}

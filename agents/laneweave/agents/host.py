@@ -151,16 +151,14 @@ class AgentHost:
         return effects
 
     def listeners(self, message: Motion | VehicleState) -> list[Name]:
-        """Return the vehicles of this process that need a message of another vehicle now."""
+        """Return the other vehicles of this process that need a message of a vehicle now."""
         if isinstance(message, Motion):
-            return [
-                name
-                for name, agent in self._agents.items()
-                if name != message.vehicle and message.stretch in agent.wanted_motions
-            ]
-        return [
-            name for name, agent in self._agents.items() if message.block in agent.wanted_states
-        ]
+            stretch = message.stretch
+            needing = [name for name, one in self._agents.items() if stretch in one.wanted_motions]
+        else:
+            block = message.block
+            needing = [name for name, one in self._agents.items() if block in one.wanted_states]
+        return [name for name in needing if name != message.vehicle]
 
     def _on_event(self, event: Event, now_s: float) -> list[Effect]:
         match event:

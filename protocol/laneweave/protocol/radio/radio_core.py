@@ -48,7 +48,7 @@ from laneweave.protocol.wire.process_messages import Report
 from laneweave.protocol.wire.topics import MOTION, OBSTACLES, PLAN, PREPARE, SENSE, STATE, Party
 
 DSRC_DELAY_S: Final = 0.002
-"""Maximum time for which IEEE 802.11p waits until nobody else sends."""
+"""Maximum channel access delay of IEEE 802.11p."""
 _CELLULAR: Final = {
     Party.VEHICLE: (PREPARE, PLAN, OBSTACLES),
     Party.COORDINATOR: (STATE,),
@@ -126,16 +126,20 @@ class RadioCore(DelayingCore):
         """Metrics of the wrapped core and of the radio."""
         return (*super().metrics, RadioMetrics(self._sent.copy(), self._lost.copy()))
 
-    def _on_overflow(self) -> None:
-        self._lost["overflow"] += 1
+    def _on_overflow(self, arrived: Arrived) -> None:
+        if arrived.vehicles is None:
+            self._count_lost("cellular", self._reporter(arrived))
+        else:
+            for vehicle in arrived.vehicles:
+                self._count_lost("sidelink", vehicle)
 
     def _passed(self, effect: Effect) -> Effect:
         """Add the counters of the radio to reports."""
         if isinstance(effect, Send) and isinstance(effect.message, Report):
             name = effect.message.name
-            report = replace(effect.message, **self._counts[name])
+            report = replace(effect.message, **self._counts.get(name, Counter[str]()))
             if self._party is Party.VEHICLE and name not in self._situations:
-                del self._counts[name]  # it has left the road
+                self._counts.pop(name, None)  # it has left the road
             return Send(effect.topic, report, effect.parameters)
         return effect
 
@@ -176,9 +180,10 @@ class RadioCore(DelayingCore):
             distance_m = abs(situation.position_m(t_s) - s_m)
             chance = self._curves.arrival(distance_m, situation.senders_per_km)
             bad = self._bursts.is_bad((message.vehicle, vehicle), now_s)
-            lost = bad or self._random.random() >= chance**packets
-            self._count("sidelink", vehicle, lost=lost)
-            if not lost:
+            self._count("sidelink", vehicle)
+            if bad or self._random.random() >= chance**packets:
+                self._count_lost("sidelink", vehicle)
+            else:
                 heard.append(vehicle)
         if not heard:
             return ()
@@ -188,24 +193,35 @@ class RadioCore(DelayingCore):
 
     def _by_cellular(self, arrived: Arrived, now_s: float) -> Iterable[tuple[float, Arrived]]:
         """Return the message unless the network loses it on its way to or from a vehicle."""
-        radio, draw = self._radio, self._random.random
-        vehicle = arrived.parameters.get("vehicle", self._name)
-        bad = self._bursts.is_bad(vehicle, now_s)
-        lost = draw() < radio.cellular_loss or bad
-        reporter = vehicle if self._party is Party.VEHICLE else self._name
-        self._count("cellular", reporter, lost=lost)
-        if lost:
+        radio, draw, reporter = self._radio, self._random.random, self._reporter(arrived)
+        bad = self._bursts.is_bad(arrived.parameters.get("vehicle", self._name), now_s)
+        self._count("cellular", reporter)
+        if draw() < radio.cellular_loss or bad:
+            self._count_lost("cellular", reporter)
             return ()
         return ((radio.cellular_delay_s + radio.cellular_jitter_s * draw(), arrived),)
 
-    def _count(self, channel: str, reporter: str, *, lost: bool) -> None:
+    def _reporter(self, arrived: Arrived) -> str:
+        """Return who reports a message by the cellular network.
+
+        A message to all vehicles of a process is reported by one of those on the road.
+        """
+        if self._party is not Party.VEHICLE:
+            return self._name
+        vehicle = arrived.parameters.get("vehicle")
+        return vehicle or next(iter(self._situations), "")
+
+    def _count(self, channel: str, reporter: str) -> None:
         """Count a message for the report of a vehicle, a coordinator or the bridge."""
-        counts = self._counts[reporter]
-        counts[channel] += 1
         self._sent[channel] += 1
-        if lost:
-            counts[f"{channel}_lost"] += 1
-            self._lost[channel] += 1
+        if self._party is not Party.VEHICLE or reporter in self._situations:
+            self._counts[reporter][channel] += 1
+
+    def _count_lost(self, channel: str, reporter: str) -> None:
+        """Count the loss of a message that has been counted."""
+        self._lost[channel] += 1
+        if reporter in self._counts:
+            self._counts[reporter][f"{channel}_lost"] += 1
 
 
 class _Curves:
@@ -238,12 +254,12 @@ def _shares(radio: Radio, steps: int) -> tuple[float, ...]:
     return tuple(sidelink.arrival(steps * DENSITY_STEP_PER_KM).tolist())
 
 
-def _nobody(_: Motion | VehicleState) -> Iterable[Name]:
+def _no_listeners(_: Motion | VehicleState) -> Iterable[Name]:
     return ()
 
 
 def over_radio(
-    core: Core, scenario: Scenario, party: Party, name: str, listeners: Listeners = _nobody
+    core: Core, scenario: Scenario, party: Party, name: str, listeners: Listeners = _no_listeners
 ) -> Core:
     """Return the core of a process, wrapped if the scenario has a radio; see `RadioCore`."""
     if not scenario.radio.enabled:

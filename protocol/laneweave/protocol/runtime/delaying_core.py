@@ -39,7 +39,7 @@ class DelayingCore(ABC):
         """Return the delay [s] and the content of each copy of a message; empty: it is lost."""
 
     @abstractmethod
-    def _on_overflow(self) -> None:
+    def _on_overflow(self, arrived: Arrived) -> None:
         """Count a message that is lost because too many are delayed."""
 
     def _passed(self, effect: Effect) -> Effect:
@@ -78,7 +78,7 @@ class DelayingCore(ABC):
             elif len(self._held) < MAX_HELD:
                 heapq.heappush(self._held, (now_s + delay_s, next(self._order), copy))
             else:
-                self._on_overflow()
+                self._on_overflow(copy)
 
     def _on_wakeup(self, wakeup: Wakeup, now_s: float) -> Iterator[Effect]:
         while self._held and self._held[0][0] <= now_s:

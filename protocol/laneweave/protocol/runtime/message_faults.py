@@ -176,7 +176,8 @@ class FaultyCore(DelayingCore):
             self._board.road_s = effect.message.t_s
         return effect
 
-    def _on_overflow(self) -> None:
+    def _on_overflow(self, arrived: Arrived) -> None:
+        del arrived
         self._board.dropped += 1
 
     def _copies(self, arrived: Arrived, now_s: float) -> Iterable[tuple[float, Arrived]]:
