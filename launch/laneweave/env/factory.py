@@ -69,6 +69,9 @@ def parallel_env(
         settings = load_scenario(None if scenario is None else Path(scenario), **ROLLING)
     if settings.sumo.config:
         raise BadInputError("sumo.config", settings.sumo.config, "none: there is no SUMO here")
+    if settings.radio.enabled:
+        technology = settings.radio.technology
+        raise BadInputError("radio.technology", technology, "none: nothing is lost here")
     given: dict[str, Any] = {"vary_demand": vary_demand, "render_mode": render_mode}
     if agents == "slots":
         return SlotsEnv(settings, rewards or Rewards(), columns, slots=slots, **given)

@@ -51,8 +51,8 @@ heartbeats it has missed."""
 MAX_DELAY_S = 1.0
 """Time into its slot after which a plan that is not in force is dropped."""
 HEAR_S = 1.0
-"""Time for which a snapshot is put off while a vehicle has not been heard that should move in this
-slot: a plan from its former cell would be void for it, and for the owners of the cells it needs."""
+"""Longest time for which the snapshot waits for a state, from this slot, of each vehicle that moves
+in it: a plan from the former cell would be void for that vehicle."""
 AGAIN_S = 1.4
 """Time before a slot until which it is planned again if other parts of lanes are closed."""
 

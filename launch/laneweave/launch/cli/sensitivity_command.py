@@ -19,7 +19,7 @@ from laneweave.launch.cli.options import (
     parse_seeds,
 )
 from laneweave.launch.run.run_folder import timestamped_folder
-from laneweave.launch.run_methods import METHODS
+from laneweave.launch.run_methods import METHODS, KeepTrajectories, labelled
 from laneweave.protocol.config.scenario_files import load_scenario
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.files import write_atomically
@@ -46,35 +46,31 @@ def sensitivity(
     no_progress: NoProgress = False,
 ) -> None:
     """Change one setting at a time, in virtual time, and write a page with a tornado chart."""
-    from laneweave.launch.run_methods import parse_methods
     from laneweave.launch.studies.sensitivity import BASE, by_effect, factors_of, result_of
     from laneweave.launch.studies.sensitivity_page import write_sensitivity
-    from laneweave.launch.studies.study_runs import finished_runs
-    from laneweave.launch.sweep.points import Variant, variant_points
+    from laneweave.launch.studies.study_runs import checked_label, finished_runs
+    from laneweave.launch.sweep.points import points_of
 
     base = load_scenario(
         scenario, demand__duration_s=duration, demand__volume_veh_per_lane_h=volume
     )
-    if len(parse_methods(method)) != 1:
-        raise BadInputError("--method", method, "one method")
+    checked_label(method, "--method", base)
     if base.sumo.config:
         raise BadInputError("sumo.config", base.sumo.config, "none: a road of the scenario's own")
     factors = factors_of(method, base)
-    variants = [
-        Variant(BASE, {}),
-        *(level.variant for factor in factors for level in factor.levels),
-    ]
-    own = base.demand.volume_veh_per_lane_h
-    points = variant_points(variants, method, base, [own], parse_seeds(seeds))
-    folder = out or timestamped_folder("sensitivity")
-    with finished_runs(points, folder, check_jobs(jobs), show=not no_progress) as found:
+    levels = {level.label: level.method for factor in factors for level in factor.levels}
+    own, used = base.demand.volume_veh_per_lane_h, parse_seeds(seeds)
+    methods = {BASE: labelled(method), **levels}
+    points = points_of(base, methods, [own], used, KeepTrajectories.none)
+    folder, workers = out or timestamped_folder("sensitivity"), check_jobs(jobs)
+    with finished_runs(points, folder, workers, show=not no_progress) as found:
         results = {label: result_of(runs) for label, runs in found.items()}
-        ordered = by_effect(factors, results, results[BASE])
+        ordered = by_effect(factors, results)
         record = {
             "schema": SCHEMA,
             "method": method,
             "volume_veh_per_lane_h": own,
-            "seeds": list(parse_seeds(seeds)),
+            "seeds": list(used),
             "duration_s": base.demand.duration_s,
             BASE: attrs.asdict(results[BASE]),
             "factors": [
@@ -84,8 +80,8 @@ def sensitivity(
                     "levels": [
                         {
                             "text": level.text,
-                            "settings": dict(level.variant.settings),
-                            **attrs.asdict(results[level.variant.label]),
+                            "settings": dict(level.method.overrides),
+                            **attrs.asdict(results[level.label]),
                         }
                         for level in factor.levels
                     ],
@@ -94,12 +90,12 @@ def sensitivity(
             ],
         }
         write_atomically(folder / RESULTS_FILE, json.dumps(record, indent=1) + "\n")
+        seeds_text = f"seeds {seeds}" if len(used) > 1 else f"seed {used[0]} alone"
         lead = (
             f"{method} at {own:g} veh/(lane h), {base.demand.duration_s:g} s of arrivals, "
-            f"seeds {seeds}. One setting is changed at a time."
+            f"{seeds_text}. One setting is changed at a time."
         )
-        page = write_sensitivity(
-            folder, "laneweave: sensitivity", lead, ordered, results, results[BASE]
-        )
+        page = write_sensitivity(folder, lead, ordered, results)
+        failed = any(run.reason for runs in found.values() for run in runs)
     typer.echo(f"{page}: written")
-    raise typer.Exit(1 if any(run.reason for runs in found.values() for run in runs) else 0)
+    raise typer.Exit(1 if failed else 0)

@@ -7,6 +7,7 @@ import math
 from pathlib import Path
 from typing import Annotated
 
+import attrs
 import typer
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
@@ -22,15 +23,23 @@ from laneweave.launch.cli.options import (
     parse_seeds,
 )
 from laneweave.launch.run.run_folder import timestamped_folder
-from laneweave.launch.run_methods import METHODS
+from laneweave.launch.run_methods import METHODS, KeepTrajectories, LabelledMethod
 from laneweave.launch.studies.tuning import DEFAULT_SET, Score
-from laneweave.launch.sweep.points import Variant
 from laneweave.protocol.config.scenario_files import load_scenario
-from laneweave.protocol.errors import BadInputError, CommandFailedError
+from laneweave.protocol.errors import CommandFailedError
 from laneweave.protocol.files import write_atomically
 
 SCHEMA = "laneweave.tuning/1"
 TUNING_FILE = "tuning.json"
+HEADINGS = (
+    "score\n(s)", "travel\ntime (s)", "arrived\n(%)", "overlaps", "hard\nbrakes", "TTC\n(s)",
+    "failed\nruns",
+)  # fmt: skip
+"""Headings of the printed table, after that of the labels."""
+CAPTION = (
+    "score: mean travel time plus a second for each percent that does not leave where it wants to; "
+    "arrived: share that leaves in its lane or at its exit; TTC: smallest time to collision"
+)
 SHOWN = 5
 """Number of sets in the printed table, besides the default."""
 
@@ -54,10 +63,10 @@ def tune(
     budget: Annotated[
         int, typer.Option("--budget", metavar="N", help="Number of sets, the default included.")
     ] = 40,
-    margin: Annotated[
+    ranges: Annotated[
         list[str] | None,
         typer.Option(
-            "--margin",
+            "--range",
             metavar="FIELD=LOW:HIGH",
             help="Range of a field of the scenario; replaces that of the method, or adds to them.",
         ),
@@ -76,96 +85,71 @@ def tune(
     no_progress: NoProgress = False,
 ) -> None:
     """Find a method's best settings for a road by random search, in virtual time."""
-    from laneweave.launch.run_methods import parse_methods
-    from laneweave.launch.studies.study_runs import finished_runs
-    from laneweave.launch.studies.tuning import draw_sets, margins_of, score_of
-    from laneweave.launch.sweep.points import sweep_volumes, variant_points, volume_text
+    from laneweave.launch.studies.study_runs import checked_label, finished_runs
+    from laneweave.launch.studies.tuning import SET_PREFIX, draw_sets, ranges_of, score_of
+    from laneweave.launch.sweep.points import points_of, sweep_volumes, volume_text
 
     base = load_scenario(scenario, demand__duration_s=duration)
-    try:
-        parse_methods(method)
-    except BadInputError as error:
-        raise BadInputError("METHOD", method, error.allowed) from error
+    checked_label(method, "METHOD", base)
     own = None if base.sumo.config else volume_text(base.demand.volume_veh_per_lane_h)
     chosen = sweep_volumes(volumes or own, base)
-    margins = margins_of(method, margin or (), base)
-    sets = draw_sets(method, margins, base, budget)
+    given = ranges_of(method, ranges or (), base)
+    sets = draw_sets(method, given, base, budget)
     used = parse_seeds(seeds)
-    points = variant_points(sets, method, base, chosen, used)
-    folder = out or timestamped_folder("tune")
-    with finished_runs(points, folder, check_jobs(jobs), show=not no_progress) as runs:
-        wanted = len(chosen) * len(used)
+    points = points_of(base, sets, chosen, used, KeepTrajectories.none)
+    folder, workers = out or timestamped_folder("tune"), check_jobs(jobs)
+    with finished_runs(points, folder, workers, show=not no_progress, prefix=SET_PREFIX) as found:
         scores = sorted(
-            (score_of(one.label, runs[one.label], wanted) for one in sets),
+            (score_of(label, runs) for label, runs in found.items()),
             key=lambda score: score.score_s,
         )
-        settings = {one.label: one for one in sets}
         result = {
             "schema": SCHEMA,
             "method": method,
             "volumes_veh_per_lane_h": list(chosen),
             "seeds": list(used),
-            "margins": {name: [one.low, one.high] for name, one in margins.items()},
-            "sets": [_record(score, settings[score.label]) for score in scores],
+            "ranges": {name: [one.low, one.high] for name, one in given.items()},
+            "sets": [_record(score, sets[score.label]) for score in scores],
         }
         write_atomically(folder / TUNING_FILE, json.dumps(result, indent=1) + "\n")
-        _print(Console(), folder, scores, settings)
+        _print(Console(), folder, scores, sets[scores[0].label])
     if math.isinf(scores[0].score_s):
-        raise CommandFailedError(f"no set let all vehicles leave: see {folder}")
+        raise CommandFailedError(f"in no set, all vehicles left the road: see {folder}")
 
 
-def _record(score: Score, variant: Variant) -> dict[str, object]:
+def _record(score: Score, method: LabelledMethod) -> dict[str, object]:
     return {
-        "label": score.label,
-        "settings": dict(variant.settings),
+        "settings": dict(method.overrides),
+        **attrs.asdict(score),
         "score_s": score.score_s if math.isfinite(score.score_s) else None,
-        "travel_time_s": score.travel_time_s,
-        "in_lane_percent": score.in_lane_percent,
-        "overlaps": score.overlaps,
-        "hard_brakes": score.hard_brakes,
-        "min_ttc_s": score.min_ttc_s,
-        "failed_runs": score.failed,
     }
 
 
-def _print(console: Console, out: Path, scores: list[Score], settings: dict[str, Variant]) -> None:
+def _print(console: Console, out: Path, scores: list[Score], best: LabelledMethod) -> None:
     """Print the best sets and the default, and the best one as a part of a scenario file."""
     table = Table(box=SIMPLE_HEAD, show_edge=False, pad_edge=False, collapse_padding=True)
     table.add_column("set", no_wrap=True)
-    headings = (
-        "score\n(s)",
-        "travel\ntime (s)",
-        "in lane\n(%)",
-        "overlaps",
-        "hard\nbrakes",
-        "TTC\n(s)",
-    )
-    for heading in headings:
+    for heading in HEADINGS:
         table.add_column(heading, justify="right", no_wrap=True)
-    best = scores[0]
     for score in [*scores[:SHOWN], *(one for one in scores[SHOWN:] if one.label == DEFAULT_SET)]:
-        figures = (score.score_s, score.travel_time_s, score.in_lane_percent)
+        figures = (score.score_s, score.travel_time_s, score.arrived_percent)
         table.add_row(
             score.label,
             *("-" if one is None or math.isinf(one) else f"{one:.2f}" for one in figures),
             f"{score.overlaps}",
             f"{score.hard_brakes}",
             "-" if score.min_ttc_s is None else f"{score.min_ttc_s:.2f}",
+            f"{score.failed}",
         )
     console.print(f"laneweave tune: {escape(str(out))}", highlight=False, soft_wrap=True)
     console.print(table)
-    console.print(
-        "score: mean travel time plus a second for each percent in other lanes; TTC: smallest time "
-        "to collision",
-        style="dim",
-        highlight=False,
-    )
-    console.print(f"best: {best.label}", highlight=False)
+    console.print(CAPTION, style="dim", highlight=False)
+    console.print(f"best: {scores[0].label}, with --method {best.method}", highlight=False)
     by_table: dict[str, list[str]] = {}
-    for name, value in settings[best.label].settings.items():
+    for name, value in best.overrides.items():
         section, _, key = name.partition(".")
-        by_table.setdefault(section, []).append(f"{key} = {json.dumps(value)}")
+        if value is not None:
+            by_table.setdefault(section, []).append(f"{key} = {json.dumps(value)}")
     for section, lines in by_table.items():
-        console.print(f"[{section}]", markup=False, highlight=False)
-        for line in lines:
+        for line in (f"[{section}]", *lines):
             console.print(line, markup=False, highlight=False)

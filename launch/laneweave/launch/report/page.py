@@ -90,9 +90,11 @@ def render_page(title: str, lead: str, sections: Sequence[Section]) -> str:
     )
 
 
-def write_page(title: str, lead: str, sections: Sequence[Section], folder: Path) -> Path:
-    """Write a page atomically, and return its path."""
-    path = folder / PAGE_FILE
+def write_page(
+    title: str, lead: str, sections: Sequence[Section], folder: Path, name: str = PAGE_FILE
+) -> Path:
+    """Write a page atomically to a file of a folder, and return its path."""
+    path = folder / name
     write_atomically(path, render_page(title, lead, sections))
     return path
 

@@ -9,11 +9,11 @@ from typing import Final
 from attrs import frozen
 
 from laneweave.launch.recordings.runs import Run
-from laneweave.launch.run_methods import affects, labelled
-from laneweave.launch.sweep.points import Variant
+from laneweave.launch.run_methods import LabelledMethod, affects, labelled
+from laneweave.launch.sweep.points import checked_settings
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.fields import Scenario
-from laneweave.protocol.scenario.radio_table import C_V2X
+from laneweave.protocol.scenario.radio_table import C_V2X, Radio
 
 BASE: Final = "base"
 _ERRORS: Final = (
@@ -21,23 +21,27 @@ _ERRORS: Final = (
     "other_speed_noise_mps", "other_accel_noise_mps2",
 )  # fmt: skip
 _SHIFT: Final = 0.2
-"""Relative change of volume and v_F."""
+"""Relative change of the volume."""
+_SPEED_SHIFT: Final = 0.1
 _S3_SHIFT: Final = 1.0 / 3.0
-_TWICE: Final = 4.0
+_ERROR_FACTOR: Final = 1.5
 """Factor of the measurement errors."""
 _CYCLES_S: Final = (5.0, 7.0)
 _MEMBERS: Final = 2
 _DELAY_S: Final = 0.5
 _LOSS: Final = 0.3
+_MAX_LOSS: Final = 0.9
 
 
 @frozen
 class Level:
     """A factor at one of its ends."""
 
+    label: str
+    """Label of its runs."""
     text: str
     """Its value in words."""
-    variant: Variant
+    method: LabelledMethod
 
 
 @frozen
@@ -57,84 +61,89 @@ class Factor:
         return tuple(one for one in (self.low, self.high) if one is not None)
 
 
-def factors_of(method: str, base: Scenario) -> tuple[Factor, ...]:
-    """Return the factors that can change the results of a method on a road."""
-    return tuple(_factors(method, base))
+End = tuple[str, Mapping[str, object]]
+"""Value of a factor in words, and the settings with it."""
 
 
-def _factors(method: str, base: Scenario) -> Iterator[Factor]:
-    kind = labelled(method).method
+def factors_of(label: str, base: Scenario) -> tuple[Factor, ...]:
+    """Return the factors that can change the results of a method on a road.
 
-    def factor(name: str, *ends: tuple[str, Mapping[str, object]] | None) -> Iterator[Factor]:
+    Args:
+        label: label of the method.
+        base: scenario in which the method drives.
+    """
+    known = labelled(label)
+    found = []
+    for name, ends in _ends(known.settings(base)):
         levels, refused = list[Level | None](), list[str]()
         for side, end in zip(("low", "high"), ends, strict=True):
-            if end is None or not all(affects(field, kind) for field in end[1]):
-                levels.append(None)
-                continue
-            text, settings = end
-            variant = Variant(f"{name.replace(' ', '-')}-{side}", settings)
-            try:
-                variant.scenario(method, base)
-            except BadInputError as error:
-                refused.append(f"{name} {text}: {error}")
-                levels.append(None)
-            else:
-                levels.append(Level(text, variant))
-        if refused or any(levels):
-            low, high = levels
-            yield Factor(name, low, high, tuple(refused))
+            level = None
+            if end is not None and all(affects(field, known.method) for field in end[1]):
+                text, settings = end
+                method = LabelledMethod(known.method, {**known.overrides, **settings})
+                try:
+                    checked_settings(method, base)
+                except BadInputError as error:
+                    refused.append(f"{name} {text}: {error}")
+                else:
+                    level = Level(f"{name.replace(' ', '-')}-{side}", text, method)
+            levels.append(level)
+        low, high = levels
+        if low or high or refused:
+            found.append(Factor(name, low, high, tuple(refused)))
+    return tuple(found)
 
-    def scaled(
-        field: str, value: float, shift: float, unit: str
-    ) -> Iterable[tuple[str, Mapping[str, object]]]:
-        for sign in (-1.0, 1.0):
-            changed = float(f"{value * (1.0 + sign * shift):.4g}")
-            yield f"{changed:g} {unit}", {field: changed}
 
-    lanes = base.road.lanes
-    if lanes > 1 and not (base.entrance or base.exit or base.demand.destinations):
+def _ends(own: Scenario) -> Iterator[tuple[str, tuple[End | None, End | None]]]:
+    """Yield the name and the ends of each factor, given the scenario of the method itself."""
+    road, formation, lanes = own.road, own.formation, own.road.lanes
+    if lanes > 1 and own.flow.lane_shares:
         others = 0.4 / (lanes - 1)
         right, left = [0.6, *[others] * (lanes - 1)], [*[others] * (lanes - 1), 0.6]
-        yield from factor(
+        yield (
             "preferred lanes",
-            ("60 % the right one", {"demand.lane_shares": right}),
-            ("60 % the left one", {"demand.lane_shares": left}),
+            (
+                ("60 % the right one", {"demand.lane_shares": right}),
+                ("60 % the left one", {"demand.lane_shares": left}),
+            ),
         )
-    volume = base.demand.volume_veh_per_lane_h
-    yield from factor(
-        "volume", *scaled("demand.volume_veh_per_lane_h", volume, _SHIFT, "veh/(lane h)")
-    )
-    yield from factor("length of S3", *scaled("road.s3_m", base.road.s3_m, _S3_SHIFT, "m"))
-    yield from factor(
-        "v_F", *scaled("formation.speed_mps", base.formation.speed_mps, _SHIFT, "m/s")
-    )
-    short_s, long_s = _CYCLES_S
-    yield from factor(
-        "T_F",
-        (f"{short_s:g} s", {"formation.cycle_s": short_s}),
-        (f"{long_s:g} s", {"formation.cycle_s": long_s}),
-    )
-    if base.formation.traits.has_formations:
-        members = base.formation.max_vehicles
-        yield from factor(
-            "N",
-            (f"{members - _MEMBERS}", {"formation.max_vehicles": members - _MEMBERS}),
-            (f"{members + _MEMBERS}", {"formation.max_vehicles": members + _MEMBERS}),
+    volume = own.demand.volume_veh_per_lane_h
+    yield "volume", _scaled("demand.volume_veh_per_lane_h", volume, _SHIFT, "veh/(lane h)")
+    yield "length of S3", _scaled("road.s3_m", road.s3_m, _S3_SHIFT, "m")
+    yield "v_F", _scaled("formation.speed_mps", formation.speed_mps, _SPEED_SHIFT, "m/s")
+    short, long = ((f"{one:g} s", {"formation.cycle_s": one}) for one in _CYCLES_S)
+    yield "T_F", (short, long)
+    if formation.traits.has_formations:
+        fewer, more = (
+            (f"{count}", {"formation.max_vehicles": count})
+            for count in (formation.max_vehicles - _MEMBERS, formation.max_vehicles + _MEMBERS)
         )
-    yield from factor(
-        "measurement errors",
-        ("none", {f"sensing.{name}": 0.0 for name in _ERRORS}),
-        (
-            f"{_TWICE:g} times",
-            {f"sensing.{name}": _TWICE * getattr(base.sensing, name) for name in _ERRORS},
-        ),
+        yield "N", (fewer, more)
+    none, large = (
+        {f"sensing.{name}": factor * getattr(own.sensing, name) for name in _ERRORS}
+        for factor in (0.0, _ERROR_FACTOR)
     )
-    radio = {"radio.technology": C_V2X} if not base.radio.enabled else {}
-    yield from factor(
-        "delay", None, (f"{_DELAY_S:g} s", {**radio, "radio.cellular_delay_s": _DELAY_S})
-    )
-    lossy = {"radio.cellular_loss": _LOSS, "radio.burst_share": _LOSS}
-    yield from factor("loss", None, (f"{100 * _LOSS:g} %, in bursts", {**radio, **lossy}))
+    yield "measurement errors", (("none", none), (f"{_ERROR_FACTOR:g} times", large))
+    yield from _radio_ends(own.radio)
+
+
+def _radio_ends(radio: Radio) -> Iterator[tuple[str, tuple[None, End]]]:
+    """Yield the factors of the radio; without one, delay and loss are those of a radio, too."""
+    enabled: dict[str, object] = {}
+    if not radio.enabled:
+        enabled = {"radio.technology": C_V2X}
+        yield "radio", (None, ("C-V2X", enabled))
+    delay_s, loss = radio.cellular_delay_s + _DELAY_S, min(radio.cellular_loss + _LOSS, _MAX_LOSS)
+    text = f"{delay_s:g} s by the network"
+    yield "delay", (None, (text, {**enabled, "radio.cellular_delay_s": delay_s}))
+    share = min(radio.burst_share + _LOSS, _MAX_LOSS)
+    settings = {**enabled, "radio.cellular_loss": loss, "radio.burst_share": share}
+    yield "loss", (None, (f"{100.0 * _LOSS:g} % more, and in bursts", settings))
+
+
+def _scaled(field: str, value: float, shift: float, unit: str) -> tuple[End, End]:
+    low, high = (float(f"{value * (1.0 + sign * shift):.4g}") for sign in (-1.0, 1.0))
+    return (f"{low:g} {unit}", {field: low}), (f"{high:g} {unit}", {field: high})
 
 
 @frozen
@@ -144,7 +153,8 @@ class Result:
     runs: int
     delay_s: float | None
     """Mean travel time beyond that at v_F from the first to the last metre of the road."""
-    in_lane_percent: float | None
+    arrived_percent: float | None
+    """Share of the vehicles that left where they wanted to: in their lane, or at their exit."""
     min_ttc_s: float | None
     min_gap_m: float | None
     co2_g_per_km: float | None
@@ -171,11 +181,15 @@ def result_of(runs: Sequence[Run]) -> Result:
     return Result(
         runs=len(found),
         delay_s=_mean(delays_s),
-        in_lane_percent=_mean(
-            [share for run, _ in found if (share := run.preferred_percent) is not None]
+        arrived_percent=_mean(
+            [
+                100.0 * (one.vehicles.at_destination or 0) / one.vehicles.left
+                for one in summaries
+                if one.vehicles.left
+            ]
         ),
-        min_ttc_s=_least(one.safety.min_ttc_s for one in summaries),
-        min_gap_m=_least(one.safety.min_gap_m for one in summaries),
+        min_ttc_s=_minimum(one.safety.min_ttc_s for one in summaries),
+        min_gap_m=_minimum(one.safety.min_gap_m for one in summaries),
         co2_g_per_km=_mean(petrol),
         overlaps=sum(one.safety.overlaps for one in summaries),
         not_left=sum(one.vehicles.demanded - one.vehicles.left for one in summaries),
@@ -186,18 +200,17 @@ def _mean(values: Sequence[float]) -> float | None:
     return fmean(values) if values else None
 
 
-def _least(values: Iterable[float | None]) -> float | None:
+def _minimum(values: Iterable[float | None]) -> float | None:
     return min((one for one in values if one is not None), default=None)
 
 
-def by_effect(
-    factors: Iterable[Factor], results: Mapping[str, Result], base: Result
-) -> list[Factor]:
+def by_effect(factors: Iterable[Factor], results: Mapping[str, Result]) -> list[Factor]:
     """Return the factors, that with the largest effect on the mean delay first."""
+    base_s = results[BASE].delay_s
 
     def effect_s(factor: Factor) -> float:
-        known = [results[one.variant.label].delay_s for one in factor.levels]
-        delays_s = [one for one in (*known, base.delay_s) if one is not None]
+        known = [results[one.label].delay_s for one in factor.levels]
+        delays_s = [one for one in (*known, base_s) if one is not None]
         return max(delays_s, default=0.0) - min(delays_s, default=0.0)
 
     return sorted(factors, key=effect_s, reverse=True)

@@ -10,32 +10,42 @@ from __future__ import annotations
 import math
 import random
 from collections.abc import Iterable, Mapping, Sequence
-from operator import attrgetter
 from statistics import fmean
 from types import MappingProxyType
-from typing import Final
+from typing import Any, Final
 
 from attrs import frozen
 
 from laneweave.launch.recordings.runs import Run
-from laneweave.launch.run_methods import LC2013, RULE, labelled
-from laneweave.launch.sweep.points import Variant
+from laneweave.launch.run_methods import (
+    FORMATION,
+    LC2013,
+    RULE,
+    LabelledMethod,
+    affects,
+    labelled,
+)
+from laneweave.launch.sweep.points import checked_settings
+from laneweave.protocol.config.scenario_files import to_tables
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.fields import Scenario
 
 DEFAULT_SET: Final = "default"
-MAX_BUDGET: Final = 10_000
+SET_PREFIX: Final = "set-"
+MAX_BUDGET: Final = 1000
 MAX_TRIES: Final = 1000
 """Maximum number of draws for a set that the scenario allows."""
 OTHER_LANE_S: Final = 1.0
-"""Seconds that a percent of vehicles costs which leave in another lane than the preferred one."""
+"""Penalty for each percent of vehicles that do not leave where they want to [s]."""
 _LOGARITHMIC: Final = 10.0
 """Ranges whose ends have at least this ratio are drawn uniformly in the logarithm."""
+_NOT_VARIED: Final = ("demand.volume_veh_per_lane_h", "demand.duration_s")
+"""Fields that all sets of a search must share."""
 
 
 @frozen
-class Margin:
-    """Range of a field within which the search draws."""
+class Range:
+    """Range of a field from which the search draws."""
 
     low: float
     high: float
@@ -53,105 +63,108 @@ class Margin:
         return min(max(float(f"{value:.3g}"), self.low), self.high)
 
 
-MARGINS: Final[Mapping[str, Mapping[str, Margin]]] = MappingProxyType(
+RANGES: Final[Mapping[str, Mapping[str, Range]]] = MappingProxyType(
     {
         LC2013: {
-            "lc2013.min_gap_m": Margin(0.0, 2.5),
-            "lc2013.accel_mps2": Margin(1.0, 5.0),
-            "lc2013.decel_mps2": Margin(2.0, 10.0),
-            "lc2013.strategic": Margin(0.3, 100.0),
-            "lc2013.cooperative": Margin(0.0, 1.0),
-            "lc2013.assertive": Margin(0.5, 5.0),
+            "lc2013.min_gap_m": Range(0.0, 2.5),
+            "lc2013.accel_mps2": Range(1.0, 5.0),
+            "lc2013.decel_mps2": Range(2.0, 10.0),
+            "lc2013.strategic": Range(0.3, 100.0),
+            "lc2013.cooperative": Range(0.0, 1.0),
+            "lc2013.assertive": Range(0.5, 5.0),
         },
         RULE: {
-            "rule.standstill_gap_m": Margin(1.0, 8.0),
-            "rule.stop_distance_m": Margin(20.0, 400.0),
-            "rule.slow_down_mps2": Margin(1.0, 6.0),
+            "rule.standstill_gap_m": Range(1.0, 8.0),
+            "rule.stop_distance_m": Range(20.0, 400.0),
+            "rule.slow_down_mps2": Range(1.0, 6.0),
         },
     }
 )
-"""Margins of the reference methods: how they drive. Headways and durations of lane changes, which
-describe vehicles, keep their values unless margins of them are given."""
+"""Ranges of the reference methods: how they drive. Headways and durations of lane changes, which
+describe vehicles, keep their values unless ranges of them are given."""
 
 
-def margins_of(method: str, given: Iterable[str], base: Scenario) -> dict[str, Margin]:
-    """Return the margins of a search.
+def ranges_of(label: str, given: Iterable[str], base: Scenario) -> dict[str, Range]:
+    """Return the ranges of a search.
 
     Args:
-        method: label of the method.
-        given: margins as `table.field=LOW:HIGH`, which replace or extend those of the method.
+        label: label of the method.
+        given: ranges as `table.field=LOW:HIGH`, which replace those of the method, or add to them.
         base: scenario, whose fields may be varied.
 
     Raises:
-        BadInputError: a margin is malformed, or of no number in the scenario; or there are none.
+        BadInputError: a range is malformed, or of no number that affects the method; or there are
+            none.
     """
-    margins = dict(MARGINS.get(labelled(method).method, {}))
+    method = labelled(label).method
+    ranges, tables = dict(RANGES.get(method, {})), to_tables(base)
     for text in given:
         name, _, limits = text.partition("=")
-        margins[name] = _margin(name, limits, text, base)
-    if not margins:
-        allowed = f"at least one margin: there are none of {method} without it"
-        raise BadInputError("--margin", "", allowed)
-    return margins
+        table, _, key = name.partition(".")
+        fields = tables.get(table)
+        if not isinstance(fields, Mapping) or key not in fields:
+            raise BadInputError("--range", text, "TABLE.FIELD=LOW:HIGH, a field of scenario files")
+        if name in _NOT_VARIED or not affects(name, method):
+            raise BadInputError("--range", text, f"a field that affects how {label} drives")
+        ranges[name] = _range(text, limits, fields[key])
+    if not ranges:
+        raise BadInputError("--range", "", f"at least one range: there are none of {label} itself")
+    return ranges
 
 
-def _margin(name: str, limits: str, text: str, base: Scenario) -> Margin:
+def _range(text: str, limits: str, value: Any) -> Range:  # noqa: ANN401 (of any field)
+    """Return the range of a field that has some value now."""
+    if isinstance(value, bool) or not isinstance(value, float | int | None):
+        raise BadInputError("--range", text, "a field with one number")
     low_text, _, high_text = limits.partition(":")
     try:
         low, high = float(low_text), float(high_text)
     except ValueError:
-        raise BadInputError("--margin", text, "TABLE.FIELD=LOW:HIGH, two numbers") from None
+        raise BadInputError("--range", text, "TABLE.FIELD=LOW:HIGH, two numbers") from None
     if not -math.inf < low <= high < math.inf:
-        raise BadInputError("--margin", text, "TABLE.FIELD=LOW:HIGH with LOW <= HIGH")
-    try:
-        value = attrgetter(name)(base)
-    except AttributeError:
-        value = ""
+        raise BadInputError("--range", text, "TABLE.FIELD=LOW:HIGH with LOW <= HIGH")
     whole = isinstance(value, int)
-    if name.count(".") != 1 or isinstance(value, bool) or not isinstance(value, float | int | None):
-        raise BadInputError("--margin", text, "a field of a scenario file with one number")
     if whole and math.ceil(low) > math.floor(high):
-        raise BadInputError("--margin", text, "a range with a whole number")
-    return Margin(low, high, whole)
+        raise BadInputError("--range", text, "a range with a whole number")
+    return Range(low, high, whole)
 
 
 def draw_sets(
-    method: str, margins: Mapping[str, Margin], base: Scenario, budget: int
-) -> tuple[Variant, ...]:
+    label: str, ranges: Mapping[str, Range], base: Scenario, budget: int
+) -> dict[str, LabelledMethod]:
     """Return the sets to compare: that of the method, and others drawn with the scenario's seed.
 
+    A larger budget adds sets to those of a smaller one.
+
     Raises:
-        BadInputError: no set within the margins is allowed in the scenario.
+        BadInputError: no set within the ranges is allowed in the scenario.
     """
     if not 2 <= budget <= MAX_BUDGET:
         raise BadInputError("--budget", budget, f"[2, {MAX_BUDGET}]")
     # Equal seeds draw equal sets.
-    generator = random.Random(f"{base.seed}/tuning/{method}")  # noqa: S311 (no secrets)
-    sets, digits = [Variant(DEFAULT_SET, {})], len(f"{budget - 1}")
-    while len(sets) < budget:
-        sets.append(_drawn(f"set-{len(sets):0{digits}}", method, margins, base, generator))
-    return tuple(sets)
+    generator = random.Random(f"{base.seed}/tuning/{label}")  # noqa: S311 (no secrets)
+    drawn = {
+        f"{SET_PREFIX}{number:04}": _drawn(label, ranges, base, generator)
+        for number in range(1, budget)
+    }
+    return {DEFAULT_SET: labelled(label), **drawn}
 
 
 def _drawn(
-    label: str,
-    method: str,
-    margins: Mapping[str, Margin],
-    base: Scenario,
-    generator: random.Random,
-) -> Variant:
-    problem: BadInputError | None = None
+    label: str, ranges: Mapping[str, Range], base: Scenario, generator: random.Random
+) -> LabelledMethod:
+    known, problem = labelled(label), ""
     for _ in range(MAX_TRIES):
-        values = {name: margin.draw(generator) for name, margin in margins.items()}
-        variant = Variant(label, values)
+        values = {name: one.draw(generator) for name, one in ranges.items()}
+        method = LabelledMethod(known.method, {**known.overrides, **values})
         try:
-            variant.scenario(method, base)
+            checked_settings(method, base)
         except BadInputError as error:
-            problem = error
-            continue
-        return variant
-    reason = "" if problem is None else f" ({problem})"
-    raise BadInputError("--margin", method, f"margins with a set that is allowed{reason}")
+            problem = str(error)
+        else:
+            return method
+    texts = (f"{name}={one.low:g}:{one.high:g}" for name, one in ranges.items())
+    raise BadInputError("--range", " ".join(texts), f"ranges with an allowed set ({problem})")
 
 
 @frozen
@@ -160,41 +173,50 @@ class Score:
 
     label: str
     score_s: float
-    """Mean travel time, plus `OTHER_LANE_S` for each percent in other lanes; infinite: the set is
-    not eligible."""
+    """Mean travel time, plus `OTHER_LANE_S` for each percent of vehicles that do not leave where
+    they want to; infinite: the set is not eligible."""
     travel_time_s: float | None
     """Mean travel time from the demanded arrival."""
-    in_lane_percent: float | None
-    """Share of the vehicles that left in their preferred lanes."""
+    arrived_percent: float | None
+    """Share of the vehicles that left where they wanted to: in their lane, or at their exit."""
     overlaps: int
     hard_brakes: int
     min_ttc_s: float | None
     failed: int
-    """Number of runs that failed, or did not finish."""
+    """Number of runs that failed, or in which vehicles have not left."""
 
 
-def score_of(label: str, runs: Sequence[Run], wanted: int) -> Score:
-    """Return the score of a set with a wanted number of runs; see `Score`.
+def score_of(label: str, runs: Sequence[Run]) -> Score:
+    """Return the score of a set; see `Score`.
 
-    A set with a run that failed for another reason than an overlap is not eligible: reference
-    methods let bodies of 2 m overlap while they change lanes at once.
+    A set is not eligible if vehicles have not left the road. Overlaps make formation control
+    ineligible, but not reference methods, whose bodies may overlap while they change lanes at once.
     """
-    summaries = [run.summary for run in runs if run.summary is not None]
-    times_s = [one.travel_time_s.mean for one in summaries if one.travel_time_s.mean is not None]
-    shares = [one for run in runs if (one := run.preferred_percent) is not None]
-    left_all = [one for one in summaries if one.vehicles.left == one.vehicles.demanded]
-    complete = len(left_all) == len(times_s) == len(shares) == wanted
+    done = [one.summary for one in runs if one.summary is not None and _is_complete(one)]
+    times_s = [one.travel_time_s.mean for one in done if one.travel_time_s.mean is not None]
+    shares = [
+        100.0 * (one.vehicles.at_destination or 0) / one.vehicles.left
+        for one in done
+        if one.vehicles.left
+    ]
     score_s = math.inf
-    if complete:
+    if len(done) == len(times_s) == len(shares) == len(runs):
         score_s = fmean(times_s) + OTHER_LANE_S * (100.0 - fmean(shares))
-    ttcs_s = [one.safety.min_ttc_s for one in summaries if one.safety.min_ttc_s is not None]
+    known = [one.summary for one in runs if one.summary is not None]
+    ttcs_s = [one.safety.min_ttc_s for one in known if one.safety.min_ttc_s is not None]
     return Score(
         label=label,
         score_s=score_s,
         travel_time_s=fmean(times_s) if times_s else None,
-        in_lane_percent=fmean(shares) if shares else None,
-        overlaps=sum(one.safety.overlaps for one in summaries),
-        hard_brakes=sum(one.safety.hard_brakes or 0 for one in summaries),
+        arrived_percent=fmean(shares) if shares else None,
+        overlaps=sum(one.safety.overlaps for one in known),
+        hard_brakes=sum(one.safety.hard_brakes or 0 for one in known),
         min_ttc_s=min(ttcs_s, default=None),
-        failed=wanted - len(left_all),
+        failed=len(runs) - len(done),
     )
+
+
+def _is_complete(run: Run) -> bool:
+    if run.summary is None or run.summary.vehicles.left < run.summary.vehicles.demanded:
+        return False
+    return not (run.method == FORMATION and run.reason)

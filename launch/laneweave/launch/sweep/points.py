@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 from attrs import evolve, frozen
 
@@ -85,86 +85,61 @@ def plan_points(
     seeds: Sequence[int],
     keep: KeepTrajectories,
 ) -> tuple[Point, ...]:
-    """Return all points in the order of execution: seed by seed.
+    """Return the points of labels; see `points_of`."""
+    return points_of(base, {label: labelled(label) for label in labels}, volumes, seeds, keep)
+
+
+def points_of(
+    base: Scenario,
+    methods: Mapping[str, LabelledMethod],
+    volumes: Sequence[float],
+    seeds: Sequence[int],
+    keep: KeepTrajectories,
+) -> tuple[Point, ...]:
+    """Return all points of methods by label, in the order of execution: seed by seed.
 
     Raises:
-        BadInputError: there are too many points, or settings of a label contradict the scenario.
+        BadInputError: there are too many points, or settings of a method contradict the scenario.
     """
-    count = len(labels) * len(volumes) * len(seeds)
+    count = len(methods) * len(volumes) * len(seeds)
     if count > MAX_POINTS:
         raise BadInputError("--seeds", len(seeds), f"at most {MAX_POINTS} runs, not {count}")
-    settings: list[tuple[str, Scenario]] = []
-    for label in labels:
+    settings: list[tuple[str, LabelledMethod, Scenario]] = []
+    for label, method in methods.items():
         for volume in volumes:
             try:
-                scenario = with_volume(labelled(label).settings(base), volume)
-                check_moves(scenario)
-                check_plug_ins(scenario, labelled(label).method)
+                # A method may have a volume of its own.
+                scenario = checked_settings(method, with_volume(base, volume))
             except BadInputError as error:
                 field = f"{error.field} ({label})"
                 raise BadInputError(field, error.value, error.allowed) from error
-            settings.append((label, scenario))
+            settings.append((label, method, scenario))
     kept = {
         KeepTrajectories.none: (),
         KeepTrajectories.first_seed: seeds[:1],
         KeepTrajectories.all: seeds,
     }[keep]
     return tuple(
-        Point(label, labelled(label).method, evolve(scenario, seed=seed), seed in kept)
+        Point(label, method.method, evolve(scenario, seed=seed), seed in kept)
         for seed in seeds
-        for label, scenario in settings
+        for label, method, scenario in settings
     )
 
 
-@frozen
-class Variant:
-    """A method with settings that replace some of its own."""
-
-    label: str
-    settings: Mapping[str, object]
-    """Values by `table.field`."""
-
-    def scenario(self, method: str, base: Scenario) -> Scenario:
-        """Return the scenario of the labelled method `method` with these settings.
-
-        Raises:
-            BadInputError: the settings contradict each other or the scenario.
-        """
-        known = labelled(method)
-        return LabelledMethod(known.method, {**known.overrides, **self.settings}).settings(base)
-
-
-def variant_points(
-    variants: Iterable[Variant],
-    method: str,
-    base: Scenario,
-    volumes: Sequence[float],
-    seeds: Sequence[int],
-) -> tuple[Point, ...]:
-    """Return the points of variants x volumes x seeds, seed by seed.
+def checked_settings(method: LabelledMethod, base: Scenario) -> Scenario:
+    """Return the scenario of a method, in which its vehicles can drive.
 
     Raises:
-        BadInputError: the settings of a variant contradict each other or the scenario.
+        BadInputError: settings contradict the scenario, moves are impossible, or a plug-in is
+            missing or does not support the scenario.
     """
-    kind = labelled(method).method
-    settings: list[tuple[str, Scenario]] = []
-    for variant in variants:
-        try:
-            for volume in volumes:
-                scenario = variant.scenario(method, with_volume(base, volume))
-                check_plug_ins(scenario, kind)
-                settings.append((variant.label, scenario))
-        except BadInputError as error:
-            field = f"{error.field} ({variant.label})"
-            raise BadInputError(field, error.value, error.allowed) from error
-    return tuple(
-        Point(label, kind, evolve(scenario, seed=seed), keep_trajectories=False)
-        for seed in seeds
-        for label, scenario in settings
-    )
+    scenario = method.settings(base)
+    check_moves(scenario)
+    _check_plug_ins(scenario, method.method)
+    return scenario
 
 
-def check_plug_ins(scenario: Scenario, method: str) -> None:
+def _check_plug_ins(scenario: Scenario, method: str) -> None:
     """Check that the plug-in of a method or planner exists, and supports the scenario.
 
     Raises:

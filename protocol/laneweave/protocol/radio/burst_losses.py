@@ -7,8 +7,8 @@ import random
 from collections.abc import Hashable
 
 MAX_LINKS = 20_000
-"""Maximum number of links whose state is known; then, the one that was used last is kept longest.
-"""
+"""Maximum number of links with a stored state; beyond it, that of the least recently used one is
+dropped."""
 
 
 class BurstLosses:
@@ -35,7 +35,7 @@ class BurstLosses:
         """Whether each link was bad, and when; the link used last at the end."""
 
     def is_bad(self, link: Hashable, now_s: float) -> bool:
-        """Return whether a link is in the bad state now; times of a link do not decrease."""
+        """Return whether a link is in the bad state now; `now_s` must not decrease for a link."""
         if not self._share:
             return False
         chance = self._share

@@ -10,7 +10,9 @@ path loss of WINNER+ B1 in line of sight and log-normal shadowing. A message is 
 - it collides with a message of another vehicle.
 
 The models give curves over the distance for one density of senders and one transmission power.
-They were validated up to 0.3 vehicles/m (C-V2X) and 0.12 vehicles/m at 25 Hz (802.11p).
+They were validated up to 0.3 vehicles/m (C-V2X) and 0.12 vehicles/m at 25 Hz (802.11p). Beyond
+that, vehicles with C-V2X raise their sensing threshold by 3 dB until enough resources are left, as
+in the standard (3GPP TS 36.213, 14.1.1.6), which [1] leaves out.
 
 [1] M. Gonzalez-Martín, M. Sepulcre, R. Molina-Masegosa, J. Gozalvez, "Analytical Models of the
     Performance of C-V2X Mode 4 Vehicular Communications", IEEE Transactions on Vehicular
@@ -82,7 +84,10 @@ class Sidelink(ABC):
 
     @abstractmethod
     def _arrival(self, spacing_m: float) -> Floats:
-        """Return the share that arrives at each of `DISTANCES_M`, by the distance of senders."""
+        """Return the share that arrives at each of `DISTANCES_M`.
+
+        `spacing_m` is the distance between neighbouring senders.
+        """
 
     def arrival(self, density_per_km: float) -> Floats:
         """Return the share of messages that arrive at each of `DISTANCES_M`.

@@ -27,7 +27,7 @@ class Radio:
     rate_hz: float = field(default=10.0, validator=within(1.0, 50.0))
     """Number of messages per second that every vehicle is assumed to send by sidelink."""
     other_senders_per_km: float = field(default=0.0, validator=within(0.0, 500.0))
-    """Senders that are not on the road, such as those of the opposite direction."""
+    """Density of senders that are not on the road, such as those of the opposite direction."""
     burst_share: float = field(default=0.02, validator=within(0.0, 0.9))
     """Share of time in which a receiver hears nothing of a sender (Gilbert-Elliott)."""
     burst_s: float = field(default=0.5, validator=within(0.01, 60.0))

@@ -9,6 +9,7 @@ import pytest
 from attrs import evolve
 
 from laneweave.launch.recordings.runs import Run
+from laneweave.launch.run_methods import LabelledMethod
 from laneweave.launch.studies.sensitivity import (
     Factor,
     Level,
@@ -18,9 +19,7 @@ from laneweave.launch.studies.sensitivity import (
     result_of,
 )
 from laneweave.launch.studies.sensitivity_page import draw_tornado, results_table
-from laneweave.launch.sweep.points import Variant
 from laneweave.protocol.config.scenario_files import load_scenario, scenario_of
-from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.radio_table import C_V2X, DSRC
 from support.commands import Here
 from support.summaries import make_summary
@@ -50,27 +49,35 @@ def result(delay_s: float | None) -> Result:
 def test_all_factors_of_formations() -> None:
     assert names("formation") == [
         "preferred lanes", "volume", "length of S3", "v_F", "T_F", "N", "measurement errors",
-        "delay", "loss",
+        "radio", "delay", "loss",
     ]  # fmt: skip
 
 
 def test_factors_without_effect_are_left_out() -> None:
     assert names("lc2013") == ["preferred lanes", "volume", "length of S3", "v_F"]
-    assert "N" not in names("formation", formation__operation="rolling")
+    assert "N" not in names("rolling")
+    assert "N" in names("formations", formation__operation="rolling")
+    assert "radio" not in names("formation", radio__technology=DSRC)
 
 
-def test_levels_change_one_setting() -> None:
-    assert level("volume", "high").variant.settings == {"demand.volume_veh_per_lane_h": 1200.0}
-    assert level("v_F", "low").variant.settings == {"formation.speed_mps": 12.0}
-    assert level("N", "low").variant.settings == {"formation.max_vehicles": 4}
-    shares = level("preferred lanes", "low").variant.settings["demand.lane_shares"]
+def test_levels_change_one_setting_of_the_method() -> None:
+    assert level("volume", "high").method.overrides == {"demand.volume_veh_per_lane_h": 1200.0}
+    assert level("v_F", "low").method.overrides == {"formation.speed_mps": 13.5}
+    assert level("N", "low").method.overrides == {"formation.max_vehicles": 4}
+    shares = level("preferred lanes", "low").method.overrides["demand.lane_shares"]
     assert shares == pytest.approx([0.6, 0.2, 0.2])
-    errors = level("measurement errors", "high").variant.settings
-    assert errors["sensing.gap_noise_m"] == 4.0 * BASE.sensing.gap_noise_m
-    lossy = level("loss", "high").variant.scenario("formation", BASE).radio
-    assert (lossy.technology, lossy.cellular_loss, lossy.burst_share) == (C_V2X, 0.3, 0.3)
-    kept = level("delay", "high", radio__technology=DSRC).variant.settings
-    assert kept == {"radio.cellular_delay_s": 0.5}
+    rolling = {"formation__operation": "rolling"}
+    errors = level("measurement errors", "high", **rolling).method.overrides
+    assert errors["sensing.gap_noise_m"] == 1.5 * BASE.sensing.gap_noise_m
+    (members,) = (one for one in factors_of("paper-18", BASE) if one.name == "N")
+    assert [one.text for one in members.levels] == ["16", "20"]
+
+
+def test_delay_and_loss_are_added_to_those_of_the_radio() -> None:
+    lossy = level("loss", "high").method.settings(BASE).radio
+    assert (lossy.technology, lossy.cellular_loss, lossy.burst_share) == (C_V2X, 0.31, 0.32)
+    kept = level("delay", "high", radio__technology=DSRC, radio__cellular_delay_s=2.0)
+    assert kept.method.overrides == {"radio.cellular_delay_s": 2.5}
 
 
 def test_ends_that_are_impossible_are_named() -> None:
@@ -103,16 +110,18 @@ def test_results_of_runs() -> None:
 
 def test_factors_with_larger_effects_come_first_and_bars_reach_their_ends(tmp_path: Path) -> None:
     def factor(name: str, *ends: str | None) -> Factor:
-        low, high = (None if one is None else Level(one, Variant(one, {})) for one in ends)
+        method = LabelledMethod("formation")
+        low, high = (None if one is None else Level(one, one, method) for one in ends)
         return Factor(name, low, high)
 
     factors = [factor("small", "a", "b"), factor("large", None, "c"), factor("unknown", "d", None)]
-    results = {"a": result(0.9), "b": result(1.2), "c": result(3.0), "d": result(None)}
-    ordered = by_effect(factors, results, result(1.0))
+    delays_s = {"base": 1.0, "a": 0.9, "b": 1.2, "c": 3.0, "d": None}
+    results = {label: result(delay_s) for label, delay_s in delays_s.items()}
+    ordered = by_effect(factors, results)
     assert [one.name for one in ordered] == ["large", "small", "unknown"]
-    draw_tornado(ordered, results, result(1.0), tmp_path / "chart.png")
+    draw_tornado(ordered, results, tmp_path / "chart.png")
     assert (tmp_path / "chart.png").read_bytes().startswith(b"\x89PNG")
-    table = results_table(ordered, results, result(1.0))
+    table = results_table(ordered, results)
     assert [row[:3] for row in table.rows] == [
         ("base", "", "1.00"), ("large", "c", "3.00"), ("small", "a", "0.90"),
         ("small", "b", "1.20"), ("unknown", "d", "-"),
@@ -126,8 +135,8 @@ def test_the_command_writes_a_page_and_continues(laneweave: Here, tmp_path: Path
     )  # fmt: skip
     status, out, errors = laneweave(*command)
     assert status == 0, errors
-    assert out.endswith("report.html: written\n")
-    page = (tmp_path / "study" / "report.html").read_text(encoding="utf-8")
+    assert out.endswith("sensitivity.html: written\n")
+    page = (tmp_path / "study" / "sensitivity.html").read_text(encoding="utf-8")
     assert "Mean delay with one setting changed at a time" in page
     assert "length of S3" in page
     found = json.loads((tmp_path / "study" / "sensitivity.json").read_text(encoding="utf-8"))
@@ -139,7 +148,8 @@ def test_the_command_writes_a_page_and_continues(laneweave: Here, tmp_path: Path
     assert "runs were already finished" in errors[0]
 
 
-def test_one_method_only(laneweave: Here) -> None:
-    assert laneweave.refused("sensitivity", "--method", "rule,lc2013").startswith("--method")
-    with pytest.raises(BadInputError, match="volume"):
-        load_scenario(None, demand__volume_veh_per_lane_h=-1.0)
+def test_bad_input(laneweave: Here) -> None:
+    refused = laneweave.refused
+    assert refused("sensitivity", "--method", "rule,lc2013").startswith("--method: got 'rule,lc")
+    assert refused("sensitivity", "--duration", "30").startswith("demand.duration_s: got 30")
+    assert refused("sensitivity", "--volume", "-1").startswith("demand.volume_veh_per_lane_h")
