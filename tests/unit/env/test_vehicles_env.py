@@ -316,6 +316,8 @@ def test_bad_input() -> None:
         parallel_env(SHORT, columns=0)
     with pytest.raises(BadInputError, match="sumo"):
         parallel_env({"sumo": {"config": "x.sumocfg", "corridor": "a:b"}})
+    with pytest.raises(BadInputError, match=r"radio\.technology: got 'c-v2x'"):
+        parallel_env({"radio": {"technology": "c-v2x"}})
     env = parallel_env(SHORT)
     with pytest.raises(RuntimeError, match="reset"):
         env.step({})

@@ -134,7 +134,8 @@ def checked_settings(method: LabelledMethod, base: Scenario) -> Scenario:
             missing or does not support the scenario.
     """
     scenario = method.settings(base)
-    check_moves(scenario)
+    if method.method == FORMATION:
+        check_moves(scenario)
     _check_plug_ins(scenario, method.method)
     return scenario
 
