@@ -34,7 +34,6 @@ from typing import ClassVar
 import numpy as np
 from attrs import frozen
 from numpy.typing import NDArray
-from scipy.special import ndtr
 
 from laneweave.protocol.scenario.radio_table import C_V2X, DSRC
 
@@ -113,6 +112,8 @@ class Sidelink(ABC):
 
         `threshold_db` raises the threshold.
         """
+        from scipy.special import ndtr  # noqa: PLC0415 (not in a base install)
+
         margin_db = self.power_dbm - self.path_loss_db(distance_m) - self.sensing_dbm - threshold_db
         return np.asarray(ndtr(margin_db / _SHADOWING_DB), dtype=np.float64)
 
