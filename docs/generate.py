@@ -106,6 +106,8 @@ LONG = DOCS / "evidence" / "long-run.json"
 """Memory of long runs, by `benchmarks/long_run.py`."""
 STABILITY = DOCS / "evidence" / "stability.json"
 """Output of `benchmarks/stability.py`."""
+SENSITIVITY = DOCS / "evidence" / "sensitivity.json"
+"""Output of `laneweave sensitivity`."""
 SURPRISES = DOCS / "evidence" / surprises.RECORD
 """Output of `benchmarks/surprises.py`."""
 DECISIONS = DOCS / "adr"
@@ -830,6 +832,28 @@ def _surprises() -> str:
     return "\n".join(lines)
 
 
+def _sensitivity() -> str:
+    """Return the table of a study of single settings, by `laneweave sensitivity`."""
+    study = json.loads(SENSITIVITY.read_text(encoding="utf-8"))
+    headings = (
+        "setting", "value", "mean delay", "leave where they want to", "smallest TTC",
+        "smallest gap", "CO2, petrol", "overlaps",
+    )  # fmt: skip
+    levels = [("base", study["base"] | {"text": ""})]
+    levels += [(one["name"], level) for one in study["factors"] for level in one["levels"]]
+    lines = [f"| {' | '.join(headings)} |", "|---" * len(headings) + "|"]
+    lines += [
+        f"| {name} | {level['text']} | {level['delay_s']:z.2f} s "
+        f"| {level['arrived_percent']:.2f} % | {level['min_ttc_s']:.2f} s "
+        f"| {level['min_gap_m']:.1f} m | {level['co2_g_per_km']:.1f} g/km | {level['overlaps']} |"
+        for name, level in levels
+    ]
+    refused = [f"- {reason}" for one in study["factors"] for reason in one["refused"]]
+    if refused:
+        lines += ["", "Impossible on this road:", "", *refused]
+    return "\n".join(lines)
+
+
 def _service_added(runs: list[dict[str, Any]]) -> Iterator[str]:
     yield "| at half load | requests | solving p50 / p99 | added p50 / p95 / p99 |"
     yield "|---|---|---|---|"
@@ -930,6 +954,7 @@ def parts() -> dict[str, str]:
         "closing": _closing(),
         "service": _service(),
         "stability": _stability(),
+        "sensitivity": _sensitivity(),
         "surprises": _surprises(),
         "radio": radio.table(DOCS / "evidence" / radio.RECORD),
         "stream": _stream(),
