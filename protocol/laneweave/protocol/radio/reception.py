@@ -130,7 +130,7 @@ class Sidelink(ABC):
 
     @cached_property
     def _errors_by_noise(self) -> Floats:
-        """Share of sensed messages with errors when nobody else sends, by `DISTANCES_M`."""
+        """Share of sensed messages with errors when no other vehicle sends, by `DISTANCES_M`."""
         return self._errors_at(self.noise_dbm)[:, 0]
 
     @cached_property
@@ -255,7 +255,7 @@ class CellularSidelink(Sidelink):
 
 @frozen
 class DsrcSidelink(Sidelink):
-    """IEEE 802.11p (DSRC, ITS-G5): vehicles send when they sense that nobody else does [2]."""
+    """IEEE 802.11p (DSRC, ITS-G5): vehicles send when they sense no other one sending [2]."""
 
     carrier_ghz = 5.89
     surroundings_m = 0.5
