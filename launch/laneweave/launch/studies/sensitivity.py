@@ -182,11 +182,7 @@ def result_of(runs: Sequence[Run]) -> Result:
         runs=len(found),
         delay_s=_mean(delays_s),
         arrived_percent=_mean(
-            [
-                100.0 * (one.vehicles.at_destination or 0) / one.vehicles.left
-                for one in summaries
-                if one.vehicles.left
-            ]
+            [share for one in summaries if (share := one.preferred_percent) is not None]
         ),
         min_ttc_s=_minimum(one.safety.min_ttc_s for one in summaries),
         min_gap_m=_minimum(one.safety.min_gap_m for one in summaries),

@@ -194,11 +194,7 @@ def score_of(label: str, runs: Sequence[Run]) -> Score:
     """
     done = [one.summary for one in runs if one.summary is not None and _is_complete(one)]
     times_s = [one.travel_time_s.mean for one in done if one.travel_time_s.mean is not None]
-    shares = [
-        100.0 * (one.vehicles.at_destination or 0) / one.vehicles.left
-        for one in done
-        if one.vehicles.left
-    ]
+    shares = [share for one in done if (share := one.preferred_percent) is not None]
     score_s = math.inf
     if len(done) == len(times_s) == len(shares) == len(runs):
         score_s = fmean(times_s) + OTHER_LANE_S * (100.0 - fmean(shares))
