@@ -33,7 +33,7 @@ DURATION_S: Final = 200.0
 VOLUME: Final = 1600
 OPERATIONS: Final = ("formations", "rolling")
 POWER_DBM: Final = 23.0
-"""Maximum power of most radios of vehicles."""
+"""Usual maximum transmission power of vehicle radios."""
 
 
 @frozen

@@ -836,7 +836,7 @@ def _sensitivity() -> str:
     """Return the table of a study of single settings, by `laneweave sensitivity`."""
     study = json.loads(SENSITIVITY.read_text(encoding="utf-8"))
     headings = (
-        "setting", "value", "mean delay", "leave where they want to", "smallest TTC",
+        "setting", "value", "mean delay", "in their lane", "smallest TTC",
         "smallest gap", "CO2, petrol", "overlaps",
     )  # fmt: skip
     levels = [("base", study["base"] | {"text": ""})]

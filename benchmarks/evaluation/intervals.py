@@ -59,7 +59,7 @@ def interval(values: Sequence[float]) -> Interval | None:
 
 @frozen
 class Difference:
-    """How much more of something a method has than another one, over the seeds of both."""
+    """Difference of a figure between two methods, over the seeds that both have."""
 
     mean: float
     bounds: Interval | None

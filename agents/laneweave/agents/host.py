@@ -136,9 +136,8 @@ class AgentHost:
     def handle(self, event: Event, now_s: float) -> list[Effect]:
         """Handle an event; see `Core`."""
         if isinstance(event, Arrived) and isinstance(event.message, Motion):
-            for name in self.listeners(event.message):  # changes no subscription
-                if event.vehicles is None or name in event.vehicles:
-                    self._agents[name].on_motion(event.message)
+            for agent in self._receivers(event):  # changes no subscription
+                agent.on_motion(event.message)
             return []
         try:
             if isinstance(event, Arrived):
@@ -153,12 +152,24 @@ class AgentHost:
     def listeners(self, message: Motion | VehicleState) -> list[Name]:
         """Return the other vehicles of this process that need a message of a vehicle now."""
         if isinstance(message, Motion):
-            stretch = message.stretch
-            needing = [name for name, one in self._agents.items() if stretch in one.wanted_motions]
+            needing = (
+                name
+                for name, agent in self._agents.items()
+                if message.stretch in agent.wanted_motions
+            )
         else:
-            block = message.block
-            needing = [name for name, one in self._agents.items() if block in one.wanted_states]
+            needing = (
+                name for name, agent in self._agents.items() if message.block in agent.wanted_states
+            )
         return [name for name in needing if name != message.vehicle]
+
+    def _receivers(self, event: Arrived) -> list[AgentCore]:
+        """Return the agents that need a message of another vehicle and have received it."""
+        return [
+            self._agents[name]
+            for name in self.listeners(event.message)
+            if event.vehicles is None or name in event.vehicles
+        ]
 
     def _on_event(self, event: Event, now_s: float) -> list[Effect]:
         match event:
@@ -191,12 +202,10 @@ class AgentHost:
         message = event.message
         if isinstance(message, VehicleState):
             effects, changed = [], False
-            for name in self.listeners(message):
-                if event.vehicles is None or name in event.vehicles:
-                    agent = self._agents[name]
-                    wanted = agent.wanted_states
-                    effects += agent.handle(event, now_s)
-                    changed = changed or agent.wanted_states != wanted
+            for agent in self._receivers(event):
+                wanted = agent.wanted_states
+                effects += agent.handle(event, now_s)
+                changed = changed or agent.wanted_states != wanted
             if changed:
                 self._update_subscriptions(effects)
             return effects

@@ -45,6 +45,10 @@ class LabelledMethod:
     overrides: Mapping[str, object] = field(factory=dict)
     """Scenario settings to replace, as `table.field`: value."""
 
+    def with_overrides(self, overrides: Mapping[str, object]) -> LabelledMethod:
+        """Return the method with other settings, which take precedence over its own."""
+        return LabelledMethod(self.method, {**self.overrides, **overrides})
+
     def settings(self, base: Scenario) -> Scenario:
         """Return the scenario with these settings.
 

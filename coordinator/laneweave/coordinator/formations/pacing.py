@@ -142,8 +142,10 @@ def with_pauses(
             for step, origin, target in moves
             if closes_up(step, (origin, target))
         ]
-        paused = _paused(plan, min(closing)) if closing else plan
-        if paused is plan or not in_time(paused):
+        if not closing:
+            return plan
+        paused = _paused(plan, min(closing))
+        if not in_time(paused):
             return plan
         plan = paused
 

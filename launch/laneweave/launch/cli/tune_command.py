@@ -9,10 +9,7 @@ from typing import Annotated
 
 import attrs
 import typer
-from rich.box import SIMPLE_HEAD
 from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 
 from laneweave.launch.cli.options import (
     ContinuedFolder,
@@ -37,8 +34,8 @@ HEADINGS = (
 )  # fmt: skip
 """Headings of the printed table, after that of the labels."""
 CAPTION = (
-    "score: mean travel time plus a second for each percent that does not leave where it wants to; "
-    "arrived: share that leaves in its lane or at its exit; TTC: smallest time to collision"
+    "arrived: share that leaves in its lane or at its exit; score: mean travel time plus a second "
+    "for each percent that does not; TTC: smallest time to collision"
 )
 SHOWN = 5
 """Number of sets in the printed table, besides the default."""
@@ -127,10 +124,9 @@ def _record(score: Score, method: LabelledMethod) -> dict[str, object]:
 
 def _print(console: Console, out: Path, scores: list[Score], best: LabelledMethod) -> None:
     """Print the best sets and the default, and the best one as a part of a scenario file."""
-    table = Table(box=SIMPLE_HEAD, show_edge=False, pad_edge=False, collapse_padding=True)
-    table.add_column("set", no_wrap=True)
-    for heading in HEADINGS:
-        table.add_column(heading, justify="right", no_wrap=True)
+    from laneweave.launch.sweep.sweep import console_table, print_table
+
+    table = console_table("set", HEADINGS)
     for score in [*scores[:SHOWN], *(one for one in scores[SHOWN:] if one.label == DEFAULT_SET)]:
         figures = (score.score_s, score.travel_time_s, score.arrived_percent)
         table.add_row(
@@ -141,9 +137,7 @@ def _print(console: Console, out: Path, scores: list[Score], best: LabelledMetho
             "-" if score.min_ttc_s is None else f"{score.min_ttc_s:.2f}",
             f"{score.failed}",
         )
-    console.print(f"laneweave tune: {escape(str(out))}", highlight=False, soft_wrap=True)
-    console.print(table)
-    console.print(CAPTION, style="dim", highlight=False)
+    print_table(console, f"laneweave tune: {out}", table, CAPTION)
     console.print(f"best: {scores[0].label}, with --method {best.method}", highlight=False)
     by_table: dict[str, list[str]] = {}
     for name, value in best.overrides.items():

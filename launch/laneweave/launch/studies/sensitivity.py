@@ -23,14 +23,21 @@ _ERRORS: Final = (
 _SHIFT: Final = 0.2
 """Relative change of the volume."""
 _SPEED_SHIFT: Final = 0.1
+"""Relative change of v_F."""
 _S3_SHIFT: Final = 1.0 / 3.0
+"""Relative change of the length of S3."""
 _ERROR_FACTOR: Final = 1.5
 """Factor of the measurement errors."""
 _CYCLES_S: Final = (5.0, 7.0)
+"""Low and high end of T_F."""
 _MEMBERS: Final = 2
+"""Change of the maximum number of vehicles in a formation."""
 _DELAY_S: Final = 0.5
+"""Additional delay by the cellular network."""
 _LOSS: Final = 0.3
+"""Additional loss by the cellular network, and additional share of time in bursts."""
 _MAX_LOSS: Final = 0.9
+"""Maximum of both."""
 
 
 @frozen
@@ -40,17 +47,17 @@ class Level:
     label: str
     """Label of its runs."""
     text: str
-    """Its value in words."""
+    """Value as text."""
     method: LabelledMethod
 
 
 @frozen
 class Factor:
-    """A setting that is varied, alone, to both sides or to one."""
+    """A setting with its levels; all other settings are those of the base."""
 
     name: str
     low: Level | None
-    """None: the base itself is the low end, or this end is impossible."""
+    """None: the base itself is the low end, or the low end is impossible."""
     high: Level | None
     refused: tuple[str, ...] = ()
     """Why ends are impossible in this scenario."""
@@ -62,7 +69,7 @@ class Factor:
 
 
 End = tuple[str, Mapping[str, object]]
-"""Value of a factor in words, and the settings with it."""
+"""Value of a factor as text, and the settings for it."""
 
 
 def factors_of(label: str, base: Scenario) -> tuple[Factor, ...]:
@@ -80,7 +87,7 @@ def factors_of(label: str, base: Scenario) -> tuple[Factor, ...]:
             level = None
             if end is not None and all(affects(field, known.method) for field in end[1]):
                 text, settings = end
-                method = LabelledMethod(known.method, {**known.overrides, **settings})
+                method = known.with_overrides(settings)
                 try:
                     checked_settings(method, base)
                 except BadInputError as error:
@@ -152,9 +159,9 @@ class Result:
 
     runs: int
     delay_s: float | None
-    """Mean travel time beyond that at v_F from the first to the last metre of the road."""
+    """Mean travel time, less the time that the length of the road takes at v_F."""
     arrived_percent: float | None
-    """Share of the vehicles that left where they wanted to: in their lane, or at their exit."""
+    """Share of the departed vehicles that left in their lane, or at their exit."""
     min_ttc_s: float | None
     min_gap_m: float | None
     co2_g_per_km: float | None

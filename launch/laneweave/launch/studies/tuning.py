@@ -36,7 +36,7 @@ MAX_BUDGET: Final = 1000
 MAX_TRIES: Final = 1000
 """Maximum number of draws for a set that the scenario allows."""
 OTHER_LANE_S: Final = 1.0
-"""Penalty for each percent of vehicles that do not leave where they want to [s]."""
+"""Penalty for each percent of vehicles that leave neither in their lane nor at their exit [s]."""
 _LOGARITHMIC: Final = 10.0
 """Ranges whose ends have at least this ratio are drawn uniformly in the logarithm."""
 _NOT_VARIED: Final = ("demand.volume_veh_per_lane_h", "demand.duration_s")
@@ -156,7 +156,7 @@ def _drawn(
     known, problem = labelled(label), ""
     for _ in range(MAX_TRIES):
         values = {name: one.draw(generator) for name, one in ranges.items()}
-        method = LabelledMethod(known.method, {**known.overrides, **values})
+        method = known.with_overrides(values)
         try:
             checked_settings(method, base)
         except BadInputError as error:
@@ -173,12 +173,12 @@ class Score:
 
     label: str
     score_s: float
-    """Mean travel time, plus `OTHER_LANE_S` for each percent of vehicles that do not leave where
-    they want to; infinite: the set is not eligible."""
+    """Mean travel time, plus `OTHER_LANE_S` for each percent of vehicles that leave neither in
+    their lane nor at their exit; infinite: the set is not eligible."""
     travel_time_s: float | None
     """Mean travel time from the demanded arrival."""
     arrived_percent: float | None
-    """Share of the vehicles that left where they wanted to: in their lane, or at their exit."""
+    """Share of the departed vehicles that left in their lane, or at their exit."""
     overlaps: int
     hard_brakes: int
     min_ttc_s: float | None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Iterable, Sequence
 from contextlib import closing
 from pathlib import Path
 
@@ -85,6 +85,24 @@ class _Progress(Progress):
             self.console.print(line, highlight=False, soft_wrap=True)
 
 
+def console_table(first: str, headings: Iterable[str]) -> Table:
+    """Return an empty table: a column of texts, then columns of numbers."""
+    table = Table(box=SIMPLE_HEAD, show_edge=False, pad_edge=False, collapse_padding=True)
+    table.add_column(first, no_wrap=True)
+    for heading in headings:
+        table.add_column(heading, justify="right", no_wrap=True)
+    return table
+
+
+def print_table(console: Console, title: str, table: Table, caption: str) -> None:
+    """Print a table in full, with a title above and a caption below."""
+    # On a narrow console, lines are longer than the console rather than values shortened.
+    table.width = console.measure(table, options=console.options.update(width=WIDEST)).maximum
+    console.print(escape(title), highlight=False, soft_wrap=True)
+    console.print(table, crop=False)
+    console.print(caption, highlight=False, style="dim")
+
+
 def print_results(points: Sequence[Point], folder: SweepFolder, console: Console) -> None:
     """Print a sweep's means over its seeds, and why runs failed."""
     runs = [folder.runs[point.name] for point in points]
@@ -93,10 +111,7 @@ def print_results(points: Sequence[Point], folder: SweepFolder, console: Console
     wanted = [(COUNTED, "sum"), *((column, "mean") for column in columns)]
     found = over_seeds(results_table(done), wanted)
     means = {(row["label"], row["volume_veh_per_lane_h"]): row for row in found}
-    table = Table(box=SIMPLE_HEAD, show_edge=False, pad_edge=False, collapse_padding=True)
-    table.add_column("label", no_wrap=True)
-    for heading in HEADINGS:
-        table.add_column(heading, justify="right", no_wrap=True)
+    table = console_table("label", HEADINGS)
     for (label, volume), count in Counter(
         (run.label, run.volume_veh_per_lane_h) for run in runs
     ).items():
@@ -108,11 +123,7 @@ def print_results(points: Sequence[Point], folder: SweepFolder, console: Console
         table.add_row(
             escape(label), volume_text(volume), *figures, number, f"{row['runs']}/{count}"
         )
-    # On a narrow console, lines are longer than the console rather than values shortened.
-    table.width = console.measure(table, options=console.options.update(width=WIDEST)).maximum
-    console.print(f"laneweave sweep: {escape(str(folder.out))}", highlight=False, soft_wrap=True)
-    console.print(table, crop=False)
-    console.print(CAPTION, highlight=False, style="dim")
+    print_table(console, f"laneweave sweep: {folder.out}", table, CAPTION)
     for run in runs:
         if run.reason:
             line = f"FAILED: {run.folder.name}: {run.reason}"

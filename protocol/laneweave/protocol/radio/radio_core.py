@@ -74,7 +74,7 @@ class RadioMetrics:
 
 @frozen
 class _Situation:
-    """Where a vehicle was, and how many senders were around it."""
+    """Position and speed of a vehicle at a road time, and density of senders around it."""
 
     s_m: float
     speed_mps: float
@@ -228,7 +228,7 @@ class _Curves:
     """Share of messages that arrive by sidelink."""
 
     def __init__(self, radio: Radio) -> None:
-        """Compute nothing yet: not all processes need it."""
+        """Create without curves; each is computed when it is first needed."""
         self._radio = radio
         self._by_density: dict[int, Sequence[float]] = {}
         """Share at each of `DISTANCES_M`, by the number of density steps."""

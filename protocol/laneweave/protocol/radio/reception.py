@@ -196,7 +196,7 @@ class CellularSidelink(Sidelink):
     """Share of the resources from which a vehicle draws."""
 
     def _arrival(self, spacing_m: float) -> Floats:
-        """See `Sidelink`; [1], (6) to (34)."""
+        """Apply equations (6) to (34) of [1]; see `Sidelink._arrival`."""
         resources = self.subchannels * 1000.0 / self.rate_hz
         excluded, raised_db = self._excluded(spacing_m, resources, 1.0, 3.0)
         busy = min(self._excluded(spacing_m, resources, 1.0, None)[0] / resources, 1.0)
@@ -273,7 +273,7 @@ class DsrcSidelink(Sidelink):
     """Preamble, header and message at 6 Mbit/s."""
 
     def _arrival(self, spacing_m: float) -> Floats:
-        """See `Sidelink`; [2], (1) to (35)."""
+        """Apply equations (1) to (35) of [2]; see `Sidelink._arrival`."""
         to_receiver, to_sender = self._others(spacing_m)
         load = self.rate_hz * self._duration_s * self._sensed_everywhere.sum() / spacing_m
         load = min(load, 0.913 / (2.0 * 0.2481))  # the fit's maximum

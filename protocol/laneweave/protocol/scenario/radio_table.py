@@ -29,15 +29,15 @@ class Radio:
     other_senders_per_km: float = field(default=0.0, validator=within(0.0, 500.0))
     """Density of senders that are not on the road, such as those of the opposite direction."""
     burst_share: float = field(default=0.02, validator=within(0.0, 0.9))
-    """Share of time in which a receiver hears nothing of a sender (Gilbert-Elliott)."""
+    """Share of time for which a link loses all messages, in bursts (Gilbert-Elliott)."""
     burst_s: float = field(default=0.5, validator=within(0.01, 60.0))
-    """Mean duration of such a time."""
+    """Mean duration of a burst."""
     cellular_loss: float = field(default=0.01, validator=within(0.0, 1.0))
     """Probability that the cellular network loses a message, apart from bursts."""
     cellular_delay_s: float = field(default=0.03, validator=within(0.0, 10.0))
     """Minimum delay of a message by the cellular network."""
     cellular_jitter_s: float = field(default=0.03, validator=within(0.0, 10.0))
-    """Maximum of a further delay, drawn uniformly."""
+    """Maximum additional delay, drawn uniformly."""
 
     @property
     def enabled(self) -> bool:

@@ -78,11 +78,12 @@ class Report(Message, frozen=True):
     solve_ms: bytes = b""
     """CPU time of each solve [ms], little-endian float32."""
     sidelink: Int64 = 0
-    """Number of messages of other vehicles to the sender, lost ones included; only with a radio."""
+    """Number of messages that other vehicles sent to this one, including lost ones; only with a
+    radio."""
     sidelink_lost: Int64 = 0
     """Number of those that were lost."""
     cellular: Int64 = 0
-    """Number of messages between vehicles and coordinators to the sender, lost ones included; only
+    """Number of messages sent to this process over the cellular network, including lost ones; only
     with a radio."""
     cellular_lost: Int64 = 0
     """Number of those that were lost."""
