@@ -108,7 +108,7 @@ VARIANTS = {
     },
     "S2 too": Variant(stream_road(_rolling(formation__cycle_s=4.0, formation__sort_in_s2=True))),
     "drift rewarded": Variant(costs=StreamCosts(forward=REWARD)),
-    "drift costs": Variant(costs=StreamCosts(forward=2.0)),
+    "drift free": Variant(costs=StreamCosts(forward=0.0)),
     "trains": Variant(attrs.evolve(ROAD, model=ConflictModel(("node", "edge", "closing")))),
     "0.5 s late": Variant(
         attrs.evolve(

@@ -10,7 +10,7 @@ from laneweave.launch.run_methods import KeepTrajectories
 from laneweave.launch.sweep.points import Point, plan_points
 from laneweave.protocol.scenario.fields import Scenario
 
-SEEDS: Final = range(1, 6)
+SEEDS: Final = range(1, 21)
 DURATION_S: Final = 600.0
 """Duration of the arrivals at each point."""
 VOLUMES: Final = (
@@ -51,11 +51,12 @@ PARTS: Final = (
     Part(("rule", "rule-yielding"), _up_to(1800.0), KeepTrajectories.first_seed),
     Part(("rule-net",), _up_to(1600.0), KeepTrajectories.first_seed),
     Part(("lc2013", "lc2013-4s"), _up_to(1800.0), KeepTrajectories.first_seed),
+    Part(("lc2013-tuned",), VOLUMES, KeepTrajectories.first_seed),
 )
 """Longest runs first, so that short ones fill the idle cores at the end."""
 LABELS: Final = (
     "formations", "paper-6", "paper-12", "rolling",
-    "rule", "rule-net", "rule-yielding", "lc2013", "lc2013-4s",
+    "rule", "rule-net", "rule-yielding", "lc2013", "lc2013-4s", "lc2013-tuned",
 )  # fmt: skip
 """In the order of tables."""
 FORMATIONS: Final = ("formations", "paper-6", "paper-12", "rolling")

@@ -21,11 +21,18 @@ with a margin for errors:
         <=  2 d_F - L + braking distance of the vehicle ahead - margin - errors
 
 for every tick k, with r ticks of reaction time; the square is replaced by its tangents.
+
+Where the duration permits, moves by a column are gentler than that: the cost also contains
+accelerations, brakes and throttle share one limit, and the time to collision with a vehicle that
+holds beyond the target, ahead or behind, stays above a bound tau (`Closing`), which is linear too:
+
+    |s_k| + tau |v_k|  <=  2 d_F - L
 """
 
 from __future__ import annotations
 
-from functools import lru_cache
+import math
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -64,6 +71,14 @@ _TRACKING_ERROR_M = 0.25
 _CLOSING_SPEEDUP = 0.5
 """Maximum closing speed that the tangents cover, as a fraction of v_F."""
 _TANGENTS = 5
+MIN_TTC_S = 3.2
+"""Least time to collision of a gentle move: 3 s, below which drivers are considered to be in
+conflict (decision 77), and a margin for tracking errors."""
+_APPROACH_SHARE = 0.59
+"""Least time to collision of a gentle forward move, as a fraction of the longest possible one. A
+vehicle that closes up early brakes for longer, and burns no fuel meanwhile."""
+_ACCEL_WEIGHT = 5.0
+"""Cost of squared accelerations relative to squared jerks in gentle moves [1/s2]."""
 _SETTINGS = QPSettings(
     eps_abs=1e-6,
     max_iter=40_000,
@@ -123,6 +138,29 @@ class Envelope:
         return cls(ticks, brake_mps2, max_m)
 
 
+@frozen
+class Closing:
+    """Lower bound on the time to collision with a vehicle that holds beyond the target."""
+
+    gap_m: float
+    """Net gap to that vehicle at the start of the move."""
+    ttc_s: float
+    direction: int
+    """1: it holds ahead, -1: behind."""
+
+    @classmethod
+    def of(cls, direction: int, gap_m: float, pitch_m: float, duration_s: float) -> Closing:
+        """Return the bound for a move by one column of `pitch_m`.
+
+        The longest possible time to collision is that of a gap which shrinks exponentially.
+        """
+        ttc_s = MIN_TTC_S
+        if direction > 0:
+            longest_s = duration_s / math.log(gap_m / (gap_m - pitch_m))
+            ttc_s = max(MIN_TTC_S, _APPROACH_SHARE * longest_s)
+        return cls(gap_m, ttc_s, direction)
+
+
 @lru_cache(maxsize=256)
 def move_profile(
     scenario: Scenario, limits: Vehicle, dx: int, dy: int, ticks: int | None = None
@@ -144,16 +182,24 @@ def move_profile(
         raise ValueError(f"({dx}, {dy}) does not lead to a neighbouring cell")
     if ticks is None:
         ticks = scenario.timing.move_ticks(scenario.timing.cycles_s[0])
-    beyond_m = 2.0 * scenario.formation.gap_m - scenario.types.longest_body_m
-    return plan_trajectory(
+    pitch_m, tick_s = scenario.formation.gap_m, scenario.runtime.tick_s
+    beyond_m = 2.0 * pitch_m - scenario.types.longest_body_m
+    plan = partial(
+        plan_trajectory,
         limits,
         scenario.formation.speed_mps,
-        scenario.runtime.tick_s,
+        tick_s,
         ticks,
-        dx * scenario.formation.gap_m,
+        dx * pitch_m,
         dy * scenario.road.lane_width_m,
         Envelope.behind(scenario, limits, beyond_m) if dx > 0 else None,
     )
+    if dx == 0:
+        return plan()
+    try:
+        return plan(Closing.of(dx, beyond_m, pitch_m, ticks * tick_s))
+    except InfeasibleTrajectoryError:
+        return plan()
 
 
 def check_moves(scenario: Scenario) -> None:
@@ -199,6 +245,7 @@ def plan_trajectory(
     ds_m: float,
     dy_m: float,
     envelope: Envelope | None = None,
+    closing: Closing | None = None,
 ) -> Trajectory:
     """Return the minimum-jerk trajectory from rest at (0, 0) to rest at (ds, dy); cached.
 
@@ -210,6 +257,7 @@ def plan_trajectory(
         ds_m: distance along the road, relative to the lattice.
         dy_m: distance across the road.
         envelope: bound that leaves room to brake; None: no bound.
+        closing: a gentle move with this bound; None: minimum jerk, and no bound.
 
     Raises:
         InfeasibleTrajectoryError: there is no trajectory within the limits.
@@ -220,7 +268,7 @@ def plan_trajectory(
     # A unit of time of an eighth of the duration gives all states similar magnitudes.
     unit_s = ticks * tick_s / 8.0
     program = _trajectory_program(
-        limits, speed_mps, tick_s / unit_s, unit_s, ticks, (ds_m, dy_m), envelope
+        limits, speed_mps, tick_s / unit_s, unit_s, ticks, (ds_m, dy_m), envelope, closing
     )
     what = f"{ds_m:g} m along and {dy_m:g} m across in {ticks * tick_s:g} s"
     if envelope is not None:
@@ -251,17 +299,20 @@ def _trajectory_program(
     n: int,
     end_m: tuple[float, float],
     envelope: Envelope | None,
+    closing: Closing | None,
 ) -> QuadraticProgram:
     """Return the program in units of `unit_s`: x = (z_s [3n], z_y [3n], j_s [n], j_y [n])."""
-    constraints = _constraints(limits, speed_mps, h, unit_s, n, envelope)
+    constraints = _constraints(limits, speed_mps, h, unit_s, n, envelope, closing)
     lower, upper = constraints.lower.copy(), constraints.upper.copy()
     lower[constraints.ends] = upper[constraints.ends] = [end_m[0], 0.0, 0.0, end_m[1], 0.0, 0.0]
-    return QuadraticProgram(_squared_jerks(n), constraints.matrix, lower, upper, settings=_SETTINGS)
+    cost = _cost(n, 0.0 if closing is None else _ACCEL_WEIGHT * unit_s**2)
+    return QuadraticProgram(cost, constraints.matrix, lower, upper, settings=_SETTINGS)
 
 
-def _squared_jerks(n: int) -> Any:  # noqa: ANN401 - scipy.sparse has no types
-    """Return the cost matrix of the squared jerks of n ticks."""
-    return sparse.diags([np.concatenate([np.zeros(6 * n), np.ones(2 * n)])], [0])
+def _cost(n: int, accel_weight: float = 0.0) -> Any:  # noqa: ANN401 - scipy.sparse has no types
+    """Return the cost matrix of the squared jerks, and accelerations a_s, of n ticks."""
+    along = np.tile([0.0, 0.0, accel_weight], n)
+    return sparse.diags([np.concatenate([along, np.zeros(3 * n), np.ones(2 * n)])], [0])
 
 
 @frozen(eq=False)
@@ -275,7 +326,7 @@ class _Constraints:
     """Rows of z_n, whose bounds are 0."""
 
 
-@lru_cache(maxsize=2)  # with and without an envelope, for one duration after another
+@lru_cache(maxsize=4)  # with and without the two bounds, for one duration after another
 def _constraints(
     limits: Vehicle,
     speed_mps: float,
@@ -283,6 +334,7 @@ def _constraints(
     unit_s: float,
     n: int,
     envelope: Envelope | None,
+    closing: Closing | None = None,
 ) -> _Constraints:
     """Return the constraints that all trajectories of one duration share; cached."""
     transition, effect = axis_matrices(h)
@@ -331,6 +383,12 @@ def _constraints(
             row = sparse.kron(later, np.array([[1.0, speed / brake / unit_s, 0.0]]))
             max_m = envelope.max_m - speed * (2.0 * speed_mps - speed) / (2.0 * brake)
             rows.append(([row, None, None, None], -infinite, max_m))
+    if closing is not None:
+        # The last state is at rest, so its bound is that of the gap that remains.
+        row = closing.direction * sparse.kron(eye, np.array([[1.0, closing.ttc_s / unit_s, 0.0]]))
+        rows.append(([row, None, None, None], -infinite, closing.gap_m))
+        braking_mps2 = min(limits.max_accel_mps2, -limits.min_accel_mps2)
+        rows.append(([pick(2), None, None, None], -a_unit * braking_mps2, infinite))
     heights = [next(m for m in blocks if m is not None).shape[0] for blocks, _, _ in rows]
     end = sum(heights[:ends_after])
     return _Constraints(
@@ -396,7 +454,7 @@ def _settling_program(
     width = constraints.matrix.shape[1]
     ahead = sparse.csr_matrix((np.ones(n), (np.arange(n), np.arange(0, 3 * n, 3))), (n, width))
     return QuadraticProgram(
-        _squared_jerks(n),
+        _cost(n),
         sparse.vstack([constraints.matrix, ahead]),
         np.concatenate([lower, np.full(n, behind_m)]),
         np.concatenate([upper, np.full(n, np.inf)]),

@@ -24,7 +24,7 @@ from laneweave.protocol.scenario.road_geometry import first_moves_m
 from laneweave.protocol.vehicle.lane_ends import early_start_m, sections_to_lines
 
 REWARD = -0.5
-"""Cost of a column gained forwards if drift is rewarded; a move costs 0.3."""
+"""Extra cost of a move that gains a column if drift is rewarded; a move costs 0.3."""
 
 
 Planner = Callable[
@@ -71,7 +71,7 @@ def stream_planner(scenario: Scenario) -> Planner:
 
     ROLLING.load()
     road = stream_road(scenario)
-    costs = StreamCosts(forward=REWARD if scenario.formation.reward_drift else 0.0)
+    costs = StreamCosts(forward=REWARD) if scenario.formation.reward_drift else StreamCosts()
     return checked(road, StreamPlanner(road, costs, scenario.seed).plan)
 
 

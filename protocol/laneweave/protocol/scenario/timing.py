@@ -16,15 +16,13 @@ SHORTEST_CYCLE_S, LONGEST_CYCLE_S = 4.0, 7.0
 """Range of T_F if `formation.cycle_s` is not set; the lower end is the paper's value."""
 GENTLE_MPS2 = 3.0
 """Maximum acceleration of moves within the comfortable T_F, along and across the road."""
-ROLLING_CYCLE_S = 6.0
+ROLLING_CYCLES_S = {2000.0: 6.0, 2200.0: 5.0, math.inf: 4.6}
+"""T_F of the rolling operation up to each volume [vehicles/(lane h)]; denser traffic needs more
+steps on the same road (decision 76)."""
 MIN_MERGING_SLOTS = 4
 """Number of slots that the rolling operation should have in a lane that begins and ends on the
 road, as that of a ramp; with three, up to 1 % of the vehicles did not change lanes in time at 2000
 vehicles/(lane h)."""
-COMFORTABLE_VOLUME_VEH_PER_LANE_H = 2200.0
-"""Maximum volume at which T_F of the rolling operation is the comfortable `ROLLING_CYCLE_S`. Denser
-traffic needs more steps on the same road: at 2400, 9 of 1602 vehicles miss their lanes with 5.6 s,
-but 2 of 3604 with 4 s."""
 CYCLE_STEP_S = 0.2
 """Step between values of T_F; few values keep the number of planned trajectories low."""
 
@@ -50,9 +48,8 @@ class Timing:
         if cycle_s is not None:
             return cycle_s, cycle_s
         if self._formation.traits.common_slots:
-            cycle_s = ROLLING_CYCLE_S
-            if self._volume_veh_per_lane_h > COMFORTABLE_VOLUME_VEH_PER_LANE_H:
-                cycle_s = SHORTEST_CYCLE_S
+            volume = self._volume_veh_per_lane_h
+            cycle_s = next(value for most, value in ROLLING_CYCLES_S.items() if volume <= most)
             longest_s = self._shortest_merging_s / MIN_MERGING_SLOTS
             if cycle_s > longest_s:
                 steps = math.floor(longest_s / CYCLE_STEP_S + 1e-9)

@@ -115,10 +115,12 @@ def test_slots_are_from_four_to_seven_seconds_unless_they_are_given() -> None:
     assert slower.timing.move_durations == {40}
     rolling = parse_scenario({"formation": {"operation": "rolling"}})
     assert (rolling.timing.slots_s, rolling.timing.horizon_ticks) == ((6.0,), 60)
-    dense = parse_scenario(
-        {"formation": {"operation": "rolling"}, "demand": {"volume_veh_per_lane_h": 2201.0}}
-    )
-    assert (dense.timing.slots_s, dense.timing.horizon_ticks) == ((4.0,), 40)
+    for volume, slot_s in ((2000.0, 6.0), (2000.1, 5.0), (2200.0, 5.0), (2200.1, 4.6)):
+        dense = parse_scenario(
+            {"formation": {"operation": "rolling"}, "demand": {"volume_veh_per_lane_h": volume}}
+        )
+        assert dense.timing.slots_s == (slot_s,)
+        assert dense.timing.horizon_ticks == round(slot_s / dense.runtime.tick_s)
     long = parse_scenario({"tracking": {"horizon_ticks": 80}})
     assert long.timing.horizon_ticks == 80
 

@@ -274,8 +274,9 @@ class StreamCosts:
     """Cost of each slot at whose beginning the vehicle is outside its target sections."""
     backward: float = 2.0
     """Extra cost of a move that loses a column."""
-    forward: float = 0.0
-    """Extra cost of a move that gains a column; a negative cost rewards gaining columns."""
+    forward: float = 1.0
+    """Extra cost of a move that gains a column, which needs more energy than one that loses a
+    column, but costs no time; a negative cost rewards gaining columns."""
     missing: float = 60.0
     """Cost of ending elsewhere than at a target; up to twice as much near the end."""
     closing: float = 10.0
