@@ -1,4 +1,4 @@
-"""Formation control against each reference method, by confidence intervals over the seeds."""
+"""Formation control against reference methods, by confidence intervals over the seeds."""
 
 from __future__ import annotations
 
@@ -7,12 +7,17 @@ from typing import Final
 
 from evaluation.evidence import Evidence
 from evaluation.intervals import Difference, Verdict, difference
-from evaluation.markdown import MISSING, NOT_RUN, markdown
+from evaluation.markdown import MISSING, NOT_RUN, markdown, number
+from evaluation.points import PointRow
 from evaluation.programme import FORMATIONS, LABELS, VOLUMES, planned
 
 OWN: Final = ("formations", "rolling")
 """Labels that are compared: the two operations with their default settings."""
 OPPONENTS: Final = tuple(label for label in LABELS if label not in FORMATIONS)
+TUNED: Final = ("lc2013-tuned", "sl2015-tuned")
+"""Drivers with the best sets that `laneweave tune` has found for this road."""
+FROM_VOLUME: Final = 1000.0
+"""Lowest volume in vehicles/(lane h) of the comparison with them."""
 WORDS: Final = {
     Verdict.LESS: "faster than",
     Verdict.MORE: "**slower than**",
@@ -31,7 +36,9 @@ def _of_one(evidence: Evidence, label: str) -> str:
     rows = []
     sentences = []
     for volume in (volume for volume in VOLUMES if planned(label, volume)):
-        found = {other: _travel(evidence, label, other, volume) for other in OPPONENTS}
+        found = {
+            other: _difference(evidence, label, other, volume, "travel_s") for other in OPPONENTS
+        }
         rows.append([f"{volume:g}", *(_cell(found[other], other, volume) for other in OPPONENTS)])
         words = "; ".join(_words(found))
         if words:
@@ -40,16 +47,73 @@ def _of_one(evidence: Evidence, label: str) -> str:
     return "\n\n".join([markdown(headings, rows), "\n".join(sentences) or MISSING])
 
 
-def _travel(evidence: Evidence, own: str, other: str, volume: float) -> Difference | None:
-    """Return the difference of mean travel times [s]; None: a method has no run there."""
-    found = [_by_seed(evidence, label, volume) for label in (own, other)]
+def tuned_comparison(evidence: Evidence) -> str:
+    """Return the figures of both operations beside tuned drivers, and a sentence for each pair."""
+    rows = [
+        _figures(evidence.by_key[label, volume])
+        for volume in VOLUMES
+        for label in (*OWN, *TUNED)
+        if volume >= FROM_VOLUME and (label, volume) in evidence.by_key
+    ]
+    headings = (
+        "veh/(lane h)", "method", "runs", "travel time", "below 3 s to collision, in a run",
+        "smallest time to collision", "vehicles that brake harder than 5 m/s2, in a run",
+        "CO2, petrol",
+    )  # fmt: skip
+    sentences = [
+        f"- At {volume:g}, `{own}` against `{other}`: {differences}."
+        for volume in VOLUMES
+        for own in OWN
+        for other in TUNED
+        if volume >= FROM_VOLUME and (differences := _against(evidence, own, other, volume))
+    ]
+    return "\n\n".join([markdown(headings, rows), "\n".join(sentences) or MISSING])
+
+
+def _figures(row: PointRow) -> list[str]:
+    """Return the row of a method at a volume in the comparison with tuned drivers."""
+    return [
+        f"{row.volume_veh_per_lane_h:g}",
+        f"`{row.label}`",
+        f"{len(row.seeds)}",
+        f"{number(row.mean('travel_s'), 2)} s",
+        f"{number(row.mean('ttc_below_3_s'), 1)} s",
+        f"{number(row.lowest('min_ttc_s'), 2)} s",
+        number(row.mean("hard_brakes"), 1),
+        f"{number(row.mean('co2_g_per_km'), 1)} g/km",
+    ]
+
+
+def _against(evidence: Evidence, own: str, other: str, volume: float) -> str:
+    """Return the differences of travel time and CO2 in words; empty: there are none."""
+    words = []
+    for figure, name, unit in (
+        ("travel_s", "travel time", "s"),
+        ("co2_g_per_km", "CO2", "g/km"),
+    ):
+        found = _difference(evidence, own, other, volume, figure)
+        if found is None:
+            continue
+        known = "too few runs for an interval"
+        if found.bounds is not None:
+            known = f"95 % interval {found.bounds.low:+.2f} to {found.bounds.high:+.2f}"
+        words.append(f"{name} {found.mean:+.2f} {unit} ({known})")
+    return ", ".join(words)
+
+
+def _difference(
+    evidence: Evidence, own: str, other: str, volume: float, figure: str
+) -> Difference | None:
+    """Return the difference of the means of a figure; None: a method has no run there."""
+    found = [_by_seed(evidence, label, volume, figure) for label in (own, other)]
     return difference(*found)
 
 
-def _by_seed(evidence: Evidence, label: str, volume: float) -> Mapping[int, float]:
+def _by_seed(evidence: Evidence, label: str, volume: float, figure: str) -> Mapping[int, float]:
     row = evidence.by_key.get((label, volume))
     runs = () if row is None else row.complete
-    return {run.seed: run.travel_s for run in runs if run.travel_s is not None}
+    values = {run.seed: getattr(run, figure) for run in runs}
+    return {seed: value for seed, value in values.items() if value is not None}
 
 
 def _cell(found: Difference | None, other: str, volume: float) -> str:

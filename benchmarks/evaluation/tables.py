@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from evaluation.comparisons import comparison
+from evaluation.comparisons import comparison, tuned_comparison
 from evaluation.evidence import Evidence
 from evaluation.goals import goals_table
 from evaluation.markdown import MISSING, NOT_RUN, markdown, number
@@ -24,6 +24,7 @@ def document_parts(evidence: Evidence) -> dict[str, str]:
         "evaluation safety": _by_volume(evidence, _safety),
         "evaluation comfort": _by_volume(evidence, _comfort),
         "evaluation comparison": comparison(evidence),
+        "evaluation tuned": tuned_comparison(evidence),
         "evaluation throughput": _by_volume(evidence, _throughput),
         "evaluation planning": _planning(evidence),
         "evaluation lattice": _lattice(evidence),

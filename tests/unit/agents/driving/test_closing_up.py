@@ -26,7 +26,7 @@ from laneweave.sim_bridge.bodies.plant import Plant
 SCENARIO = Scenario()
 LIMITS, LATTICE, TICK_S = SCENARIO.vehicle, SCENARIO.lattice, SCENARIO.runtime.tick_s
 V_F = LATTICE.speed_mps
-SLOTS_S = (4.0, 4.6, 5.0, 6.0, 7.0)
+SLOTS_S = (4.0, 4.6, 5.4, 6.0, 7.0)
 """The paper's T_F, those of the rolling operation, and the longest one of formations."""
 MOVES = [(dx, dy) for dx in (-1, 0, 1) for dy in (-1, 0, 1)]
 BRAKE = EmergencyBrake(LIMITS, SCENARIO.braking, TICK_S)

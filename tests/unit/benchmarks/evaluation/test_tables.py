@@ -13,12 +13,12 @@ import pytest
 from attrs import evolve
 
 import evaluate
-from evaluation.comparisons import comparison
+from evaluation.comparisons import comparison, tuned_comparison
 from evaluation.evidence import Evidence, Picture, read_evidence, write_evidence
 from evaluation.goals import goals_table, meets
 from evaluation.intervals import interval
 from evaluation.points import PlanningTimes, points_of_runs
-from evaluation.programme import FORMATIONS, GOALS, LABELS, VOLUMES, Goal, planned
+from evaluation.programme import FORMATIONS, GOALS, LABELS, SEEDS, VOLUMES, Goal, planned
 from evaluation.statements import PAPER_VOLUMES, statements_table
 from evaluation.tables import document_parts
 from evaluation.trials import Agreement, AgreementRow, CostRow, FactorRow
@@ -37,7 +37,7 @@ def full() -> Evidence:
     """Return evidence with every point, formation control at its goals, rules that congest."""
     times = {"formations": 66.6, "rolling": 66.5, "paper-6": 67.4, "paper-12": 67.4, "lc2013": 67.5}
     rows = [
-        point(label, volume, times.get(label, 45.0 + volume / 40.0))
+        point(label, volume, times.get(label, 45.0 + volume / 40.0), seeds=SEEDS)
         for label in LABELS
         for volume in VOLUMES
         if planned(label, volume)
@@ -71,7 +71,7 @@ def test_missing_values_are_marked() -> None:
     parts = document_parts(Evidence())
     assert cells(parts["evaluation travel times"], "1600") == ["1600", *["missing"] * len(LABELS)]
     assert cells(parts["evaluation travel times"], "2000")[1:] == [
-        "missing" if label in ("formations", "rolling") else "-" for label in LABELS
+        "missing" if planned(label, 2000.0) else "-" for label in LABELS
     ]
     for name in ("planning", "lattice", "agreement", "factors", "costs"):
         assert "missing" in parts[f"evaluation {name}"]
@@ -101,7 +101,7 @@ def test_cells() -> None:
         "runs", "travel times", "lanes", "margins", "brakes", "safety", "comfort", "throughput"
     )}  # fmt: skip
     assert shown == {
-        "runs": "2 of 5, 1 failed",
+        "runs": "2 of 20, 1 failed",
         "travel times": "67.12 (68.1)",
         "lanes": "99.875 % (2 off)",
         "margins": "9.80 / 0.86 / -6.8, **1 overlaps**",
@@ -118,7 +118,7 @@ def test_a_point_whose_runs_all_failed() -> None:
         evidence(changed(point("rule", 1000.0, 0.0, seeds=(1,)), complete=False, reason="x"))
     )
     assert cells(parts["evaluation travel times"], "1000")[1 + LABELS.index("rule")] == "failed"
-    assert cells(parts["evaluation runs"], "1000")[1 + LABELS.index("rule")] == "0 of 5, 1 failed"
+    assert cells(parts["evaluation runs"], "1000")[1 + LABELS.index("rule")] == "0 of 20, 1 failed"
 
 
 def test_goals() -> None:
@@ -134,7 +134,7 @@ def test_goals() -> None:
     assert cells(table, "`formations`, 1000")[3] == "holds"
     assert cells(table, "`paper-12`, 1600")[3] == "holds"
     runs = sum(planned(label, volume) for label in FORMATIONS for volume in VOLUMES)
-    spacing = f"14.93 m, minimum of {20_000 * runs:,} in {5 * runs} runs"
+    spacing = f"14.93 m, minimum of {4000 * len(SEEDS) * runs:,} in {len(SEEDS) * runs} runs"
     assert cells(table, "spacing")[2:] == [spacing, "holds"]
     assert cells(table, "real-time factor at 1600, one process, s")[2:] == ["5.90", "**missed**"]
     assert cells(table, "cost")[2:] == ["1.10 times", "holds"]
@@ -192,13 +192,13 @@ def test_statements_follow_the_data() -> None:
 
 
 def test_interpretations_of_the_rules_may_differ() -> None:
-    rows = [point("paper-6", volume, 68.0) for volume in PAPER_VOLUMES]
-    rows += [point("rule", volume, 67.0) for volume in PAPER_VOLUMES]
-    rows += [point("rule-net", volume, 200.0) for volume in PAPER_VOLUMES]
+    rows = [point("paper-6", volume, 68.0, seeds=SEEDS) for volume in PAPER_VOLUMES]
+    rows += [point("rule", volume, 67.0, seeds=SEEDS) for volume in PAPER_VOLUMES]
+    rows += [point("rule-net", volume, 200.0, seeds=SEEDS) for volume in PAPER_VOLUMES]
     table = statements_table(evidence(*rows))
     assert cells(table, "The rules bring")[2] == "so far: holds"
     assert "seeds yet" not in table
-    assert "5 seeds yet" in statements_table(evidence(point("rule", 1000.0, 67.0, seeds=(1,))))
+    assert "20 seeds yet" in statements_table(evidence(point("rule", 1000.0, 67.0, seeds=(1,))))
     for statement in ("Severe congestion", "Formation control is faster"):
         assert cells(table, statement)[2] == "so far: depends on the interpretation"
     assert "`rule` minus `paper-6` -1.0, -1.0, -1.0, -1.0, -1.0 s" in table
@@ -273,6 +273,35 @@ def test_formation_control_is_compared_seed_by_seed() -> None:
     shown = cells(text.split("\n\n")[0], "1000")
     assert shown[1] == "-1.00 [-1.00, -1.00]"
     assert shown[3] == "missing"
+
+
+def test_operations_are_compared_with_tuned_drivers() -> None:
+    seeds = range(1, 13)
+    runs = [
+        evolve(
+            one, co2_g_per_km=co2, ttc_below_3_s=1.5, min_ttc_s=2.0 + one.seed, hard_brakes=one.seed
+        )
+        for label, travel_s, co2 in (
+            ("formations", 66.0, 132.0), ("lc2013-tuned", 67.0, 130.0), ("lc2013", 68.0, 140.0)
+        )
+        for one in point(label, 1000.0, travel_s, seeds=seeds).runs
+    ]  # fmt: skip
+    few = [point(label, 1600.0, 66.0, seeds=(1, 2)) for label in ("rolling", "lc2013-tuned")]
+    text = tuned_comparison(evidence(*points_of_runs(runs), *few, point("rolling", 500.0, 66.0)))
+    table, sentences = text.split("\n\n")
+    assert cells(table, "1000 | `formations`")[2:] == [
+        "12", "66.00 s", "1.5 s", "3.00 s", "6.5", "132.0 g/km"
+    ]  # fmt: skip
+    assert len(table.splitlines()) == 6
+    exact, unknown = sentences.splitlines()
+    assert exact == (
+        "- At 1000, `formations` against `lc2013-tuned`: travel time -1.00 s "
+        "(95 % interval -1.00 to -1.00), CO2 +2.00 g/km (95 % interval +2.00 to +2.00)."
+    )
+    assert unknown == (
+        "- At 1600, `rolling` against `lc2013-tuned`: travel time +0.00 s (too few runs for an "
+        "interval), CO2 +0.00 g/km (too few runs for an interval)."
+    )
 
 
 def test_intervals() -> None:
