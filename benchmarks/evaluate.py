@@ -1,7 +1,8 @@
 """Run the evaluation and update its pages, docs/EVALUATION_*.md.
 
-    python benchmarks/evaluate.py [--only PART ...] [--labels LABEL ...] [--seeds A:B] [--add-seeds]
-                [--budget MINUTES] [--jobs N] [--duration S] [--sweeps DIR ...] [--out DIR]
+    python benchmarks/evaluate.py [--only PART ...] [--labels LABEL ...] [--volumes V ...]
+                [--seeds A:B] [--add-runs] [--budget MINUTES] [--jobs N] [--duration S]
+                [--sweeps DIR ...] [--out DIR]
 
 zenoh      three points of the sweep over Zenoh with a process per vehicle, and simulated
 speed      real-time factors of three deployments
@@ -12,10 +13,10 @@ report     docs/evidence/evaluation.json, figures in docs/images, tables in the 
 faults     benchmarks/resilience.py, over an hour; only on request
 
 Finished parts are kept: the same command continues where it stopped. With --labels the sweep runs
-only these methods, and the report replaces only their rows; with --add-seeds it keeps those of
-other seeds, so that the seeds of one version may be run on several days. With --budget the sweep
-starts no seed that would not finish in time. The exit status is 1 if a run of formation control
-violates a guarantee or a run does not finish.
+only these methods, and the report replaces only their rows; with --add-runs it keeps those of other
+seeds and volumes, so that the runs of one version may be made on several days. With --budget the
+sweep starts no seed that would not finish in time. The exit status is 1 if a run of formation
+control violates a guarantee or a run does not finish.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from evaluation.conduct import Rounds, refresh, run_trials, say
-from evaluation.programme import DURATION_S, LABELS, SEEDS
+from evaluation.programme import DURATION_S, LABELS, SEEDS, VOLUMES
 from laneweave.launch.cli.options import check_jobs, parse_seeds
 from laneweave.protocol.errors import BadInputError, CommandFailedError
 
@@ -54,6 +55,16 @@ def parse_names(option: str, names: Sequence[str], known: Sequence[str]) -> tupl
         if name not in known:
             raise BadInputError(option, name, "some of " + ", ".join(known))
     return tuple(name for name in known if name in names)
+
+
+def parse_volumes(texts: Sequence[str]) -> tuple[float, ...]:
+    """Return volumes of the evaluation.
+
+    Raises:
+        BadInputError: a volume is not one of the evaluation.
+    """
+    names = {f"{volume:g}": volume for volume in VOLUMES}
+    return tuple(names[name] for name in parse_names("--volumes", texts, tuple(names)))
 
 
 def parse_positive(option: str, text: str, unit: str) -> float:
@@ -101,6 +112,7 @@ def run(arguments: argparse.Namespace) -> bool:
         end_s = time.monotonic() + budget_s - REPORT_S
     rounds = Rounds(
         labels=labels,
+        volumes=parse_volumes(arguments.volumes),
         seeds=parse_seeds(arguments.seeds),
         duration_s=parse_positive("--duration", arguments.duration, "seconds"),
         jobs=check_jobs(arguments.jobs),
@@ -112,7 +124,7 @@ def run(arguments: argparse.Namespace) -> bool:
             good &= rounds.run(out)
         elif part == "report":
             say("report")
-            refresh(out, arguments.sweeps, labels, DOCS, add_seeds=arguments.add_seeds)
+            refresh(out, arguments.sweeps, labels, DOCS, add_runs=arguments.add_runs)
             good &= run_script(DOCS / "generate.py")
         elif part == "stability":
             say("stability")
@@ -138,9 +150,15 @@ def main() -> int:
     parser.add_argument(
         "--labels", nargs="+", metavar="LABEL", default=LABELS, help=", ".join(LABELS)
     )
+    volumes = [f"{volume:g}" for volume in VOLUMES]
+    parser.add_argument(
+        "--volumes", nargs="+", metavar="V", default=volumes, help=", ".join(volumes)
+    )
     parser.add_argument("--seeds", default=f"{SEEDS[0]}:{SEEDS[-1] + 1}", help="seeds of the sweep")
     parser.add_argument(
-        "--add-seeds", action="store_true", help="report: keep recorded runs of other seeds"
+        "--add-runs",
+        action="store_true",
+        help="report: keep recorded runs of other seeds and volumes",
     )
     parser.add_argument("--duration", default=f"{DURATION_S:g}", help="duration of arrivals [s]")
     parser.add_argument(

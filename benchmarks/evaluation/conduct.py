@@ -28,6 +28,7 @@ from evaluation.trials import (
 from laneweave.launch.recordings.runs import is_sweep, runs_of
 from laneweave.launch.sweep.execution import StoppedError, run_locally
 from laneweave.launch.sweep.folder import SweepFolder
+from laneweave.launch.sweep.points import Point
 from laneweave.launch.sweep.sweep import run_sweep
 from laneweave.protocol.config.scenario_files import load_scenario
 from laneweave.protocol.errors import BadInputError, CommandFailedError
@@ -44,9 +45,11 @@ def say(text: str) -> None:
 
 @frozen
 class Rounds:
-    """A sweep in rounds: each round runs the methods at every volume with one seed."""
+    """A sweep in rounds: each round runs the methods at the volumes with one seed."""
 
     labels: Collection[str]
+    volumes: Collection[float]
+    """In vehicles/(lane h)."""
     seeds: Sequence[int]
     duration_s: float
     """Duration of the arrivals at each point."""
@@ -67,7 +70,7 @@ class Rounds:
         with SweepFolder(out / SWEEP_FOLDER) as folder:
             folder.check_settings(base)
             for seed in self.seeds:
-                points = [point for point in points_of(base, seed) if point.label in self.labels]
+                points = [point for point in points_of(base, seed) if self._includes(point)]
                 if all(folder.is_finished(point) for point in points):
                     continue
                 began_s = time.monotonic()
@@ -83,6 +86,9 @@ class Rounds:
                     folder.runs[point.name].reason for point in points if point.label in FORMATIONS
                 )
         return kept
+
+    def _includes(self, point: Point) -> bool:
+        return point.label in self.labels and point.volume_veh_per_lane_h in self.volumes
 
 
 def run_trials(part: str, out: Path, root: Path, jobs: int) -> bool:
@@ -125,7 +131,7 @@ def collect(out: Path, sweeps: Iterable[Path], labels: Collection[str], images: 
         out: the evaluation's folder.
         sweeps: folders of other sweeps; empty: the sweep in `out`, if there is one.
         labels: labels of the rows; figures show all runs.
-        images: folder of the figures; figures that are not drawn again are removed.
+        images: folder of the figures.
 
     Raises:
         BadInputError: a folder contains no sweep, or the runs cannot be compared.
@@ -145,10 +151,6 @@ def collect(out: Path, sweeps: Iterable[Path], labels: Collection[str], images: 
     runs = list(runs_of(folders))
     rows = [row for row in run_rows(runs) if row.label in labels]
     pictures = draw_pictures(runs, images)
-    names = {picture.name for picture in pictures}
-    for path in images.glob(PICTURES):
-        if path.name not in names:
-            path.unlink()
     return evidence.updated_with(
         Evidence(setting=setting_of(runs), runs=tuple(rows), pictures=pictures)
     )
@@ -160,7 +162,7 @@ def refresh(
     labels: Collection[str],
     docs: Path,
     *,
-    add_seeds: bool = False,
+    add_runs: bool = False,
 ) -> None:
     """Bring docs/evidence/evaluation.json and the figures up to date.
 
@@ -171,7 +173,8 @@ def refresh(
         sweeps: as in `collect`.
         labels: as in `collect`.
         docs: folder of the documents.
-        add_seeds: keep recorded runs of other seeds.
+        add_runs: keep recorded runs of other seeds and volumes, and figures that are not drawn
+            again.
 
     Raises:
         BadInputError, OSError, ValueError, KeyError: as in `collect`.
@@ -179,4 +182,9 @@ def refresh(
     path = docs / "evidence" / "evaluation.json"
     recorded = read_evidence(path)
     new = collect(out, sweeps, labels, docs / "images")
-    write_evidence(recorded.updated_with(new, add_seeds=add_seeds), path)
+    evidence = recorded.updated_with(new, add_runs=add_runs)
+    write_evidence(evidence, path)
+    names = {picture.name for picture in evidence.pictures}
+    for picture in (docs / "images").glob(PICTURES):
+        if picture.name not in names:
+            picture.unlink()

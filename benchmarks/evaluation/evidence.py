@@ -71,10 +71,11 @@ class Evidence:
         """The points by label and volume."""
         return {(row.label, row.volume_veh_per_lane_h): row for row in self.points}
 
-    def updated_with(self, new: Evidence, *, add_seeds: bool = False) -> Evidence:
+    def updated_with(self, new: Evidence, *, add_runs: bool = False) -> Evidence:
         """Return a copy in which the parts of newer evidence replace the present ones.
 
-        Runs replace those of the same labels; with `add_seeds`, only those of the same seeds.
+        Runs replace those of the same labels, and figures all others; with `add_runs`, only runs of
+        the same volumes and seeds, and figures of the same names.
 
         Raises:
             BadInputError: runs of other labels have another setting.
@@ -86,13 +87,17 @@ class Evidence:
             others = [
                 row
                 for row in self.runs
-                if row.label not in labels or (add_seeds and (*row.key, row.seed) not in seeds)
+                if row.label not in labels or (add_runs and (*row.key, row.seed) not in seeds)
             ]
             if others and new.setting != self.setting:
                 names = ", ".join(sorted({row.label for row in others}))
                 raise BadInputError("setting", new.setting, f"{self.setting}, as for {names}")
             runs = sorted([*others, *new.runs], key=_order)
-            kept = evolve(kept, setting=new.setting, runs=tuple(runs), pictures=new.pictures)
+            pictures = (*self.pictures, *new.pictures) if add_runs else new.pictures
+            by_name = {picture.name: picture for picture in pictures}
+            kept = evolve(
+                kept, setting=new.setting, runs=tuple(runs), pictures=tuple(by_name.values())
+            )
         return evolve(
             kept,
             agreements=new.agreements or kept.agreements,

@@ -233,11 +233,17 @@ def test_seeds_may_be_added_on_another_day() -> None:
         point("rule", 1000.0, 70.0, seeds=(1, 2)), point("rule", 1300.0, 71.0, seeds=(1,))
     )
     new = evidence(point("rule", 1000.0, 80.0, seeds=(2, 3)))
-    found = old.updated_with(new, add_seeds=True)
+    found = old.updated_with(new, add_runs=True)
     assert [(row.volume_veh_per_lane_h, row.seed, row.travel_s) for row in found.runs] == [
         (1000.0, 1, 70.0), (1000.0, 2, 80.0), (1000.0, 3, 80.0), (1300.0, 1, 71.0),
     ]  # fmt: skip
     assert old.updated_with(new).runs == new.runs
+    all_, new_all, road = (Picture(name, "", text) for name, text in (
+        ("all.png", "old"), ("all.png", "new"), ("road.png", "")
+    ))  # fmt: skip
+    old, new = evolve(old, pictures=(all_, road)), evolve(new, pictures=(new_all,))
+    assert old.updated_with(new, add_runs=True).pictures == (new_all, road)
+    assert old.updated_with(new).pictures == (new_all,)
 
 
 def test_points_of_other_settings_are_not_mixed() -> None:
