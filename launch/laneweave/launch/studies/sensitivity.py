@@ -160,6 +160,8 @@ class Result:
     runs: int
     delay_s: float | None
     """Mean travel time, less the time that the length of the road takes at v_F."""
+    delays_s: tuple[float, ...]
+    """The same of each run."""
     arrived_percent: float | None
     """Share of the departed vehicles that left in their lane, or at their exit."""
     min_ttc_s: float | None
@@ -188,6 +190,7 @@ def result_of(runs: Sequence[Run]) -> Result:
     return Result(
         runs=len(found),
         delay_s=_mean(delays_s),
+        delays_s=tuple(delays_s),
         arrived_percent=_mean(
             [share for one in summaries if (share := one.preferred_percent) is not None]
         ),

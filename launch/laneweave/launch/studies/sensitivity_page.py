@@ -24,8 +24,8 @@ HEADINGS: Final = (
 def draw_tornado(factors: Sequence[Factor], results: Mapping[str, Result], out: Path) -> None:
     """Draw bars for each factor, from the mean delay of the base to those at its ends.
 
-    The ends have a bar each, one above the other. Without travel times of the base, the chart is
-    empty.
+    The ends have a bar each, one above the other, with a line from the smallest to the largest
+    delay of a seed. Without travel times of the base, the chart is empty.
     """
     base_s = results[BASE].delay_s
     with picture(7.0, 1.5 + 0.42 * len(factors), out, DPI) as figure:
@@ -36,11 +36,15 @@ def draw_tornado(factors: Sequence[Factor], results: Mapping[str, Result], out: 
                 delay_s = None if level is None else results[level.label].delay_s
                 if level is None or delay_s is None or base_s is None:
                     continue
-                right = delay_s >= base_s
+                right, delays_s = delay_s >= base_s, results[level.label].delays_s
                 axes.barh(row + place, delay_s - base_s, left=base_s, height=0.36, color=colour)
+                end_s = delay_s
+                if len(delays_s) > 1:
+                    axes.hlines(row + place, min(delays_s), max(delays_s), color="black", lw=0.8)
+                    end_s = max(delays_s) if right else min(delays_s)
                 axes.annotate(
                     level.text,
-                    (delay_s, row + place),
+                    (end_s, row + place),
                     xytext=(3 if right else -3, 0),
                     textcoords="offset points",
                     ha="left" if right else "right",
@@ -93,7 +97,8 @@ def write_sensitivity(
     draw_tornado(factors, results, chart)
     refused = [reason for factor in factors for reason in factor.refused]
     caption = (
-        "Mean delay with one setting changed at a time. Delay: mean travel time beyond that at "
+        "Mean delay with one setting changed at a time; lines: from the smallest to the largest "
+        "of a seed. Delay: mean travel time beyond that at "
         "v_F, the speed of the lattice; T_F: time of a step; S3: the part of the road in which "
         "vehicles change lanes; N: maximum number of vehicles of a formation."
     )

@@ -43,7 +43,8 @@ def level(factor: str, end: str, **overrides: object) -> Level:
 
 
 def result(delay_s: float | None) -> Result:
-    return Result(2, delay_s, 100.0, 3.2, 9.0, 130.0, 0, 0)
+    delays_s = () if delay_s is None else (delay_s - 0.1, delay_s + 0.1)
+    return Result(2, delay_s, delays_s, 100.0, 3.2, 9.0, 130.0, 0, 0)
 
 
 def test_all_factors_of_formations() -> None:
@@ -104,8 +105,9 @@ def test_results_of_runs() -> None:
     found = result_of(runs)
     assert found.runs == 2
     assert found.delay_s == pytest.approx(71.0 - 1000.0 / 15.0)
+    assert found.delays_s == pytest.approx((70.0 - 1000.0 / 15.0, 72.0 - 1000.0 / 15.0))
     assert (found.min_ttc_s, found.not_left, found.co2_g_per_km) == (2.9, 2, None)
-    assert result_of([]) == Result(0, None, None, None, None, None, 0, 0)
+    assert result_of([]) == Result(0, None, (), None, None, None, None, 0, 0)
 
 
 def test_factors_with_larger_effects_come_first_and_bars_reach_their_ends(tmp_path: Path) -> None:
