@@ -104,7 +104,7 @@ VARIANTS = {
         f"T_F {cycle_s:g} s": Variant(
             stream_road(_rolling(formation__cycle_s=cycle_s)), volumes=(2000, 2200, 2400)
         )
-        for cycle_s in (4.6, 5.0, 5.6, 6.0)
+        for cycle_s in (4.6, 5.0, 5.4, 6.0)
     },
     "S2 too": Variant(stream_road(_rolling(formation__cycle_s=4.0, formation__sort_in_s2=True))),
     "drift rewarded": Variant(costs=StreamCosts(forward=REWARD)),

@@ -56,9 +56,9 @@ def tuned_comparison(evidence: Evidence) -> str:
         if volume >= FROM_VOLUME and (label, volume) in evidence.by_key
     ]
     headings = (
-        "veh/(lane h)", "method", "runs", "travel time", "below 3 s to collision, in a run",
-        "smallest time to collision", "vehicles that brake harder than 5 m/s2, in a run",
-        "CO2, petrol",
+        "veh/(lane h)", "method", "runs", "travel time [s]", "below 3 s to collision [s per run]",
+        "minimum time to collision [s]", "vehicles that brake harder than 5 m/s2, per run",
+        "CO2, petrol [g/km]",
     )  # fmt: skip
     sentences = [
         f"- At {volume:g}, `{own}` against `{other}`: {differences}."
@@ -76,11 +76,11 @@ def _figures(row: PointRow) -> list[str]:
         f"{row.volume_veh_per_lane_h:g}",
         f"`{row.label}`",
         f"{len(row.seeds)}",
-        f"{number(row.mean('travel_s'), 2)} s",
-        f"{number(row.mean('ttc_below_3_s'), 1)} s",
-        f"{number(row.lowest('min_ttc_s'), 2)} s",
+        number(row.mean("travel_s"), 2),
+        number(row.mean("ttc_below_3_s"), 1),
+        number(row.lowest("min_ttc_s"), 2),
         number(row.mean("hard_brakes"), 1),
-        f"{number(row.mean('co2_g_per_km'), 1)} g/km",
+        number(row.mean("co2_g_per_km"), 1),
     ]
 
 

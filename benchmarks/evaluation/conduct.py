@@ -184,7 +184,8 @@ def refresh(
     new = collect(out, sweeps, labels, docs / "images")
     evidence = recorded.updated_with(new, add_runs=add_runs)
     write_evidence(evidence, path)
-    names = {picture.name for picture in evidence.pictures}
-    for picture in (docs / "images").glob(PICTURES):
-        if picture.name not in names:
-            picture.unlink()
+    if new.runs:
+        names = {picture.name for picture in evidence.pictures}
+        for picture in (docs / "images").glob(PICTURES):
+            if picture.name not in names:
+                picture.unlink()

@@ -118,6 +118,17 @@ _SUMO_TUNED: Final[dict[str, object]] = {
 """Found by `laneweave tune lc2013 --volumes 1000,1600,2000 --duration 300` on the paper's road: of
 the sets with the shortest travel times, within 0.1 %, the one that brakes least hard."""
 _SL2015: Final[dict[str, object]] = {"lc2013.model": "SL2015"}
+_SL2015_TUNED: Final[dict[str, object]] = {
+    **_SL2015,
+    "lc2013.min_gap_m": 0.189,
+    "lc2013.accel_mps2": 2.1,
+    "lc2013.decel_mps2": 6.22,
+    "lc2013.strategic": 0.85,
+    "lc2013.cooperative": 0.597,
+    "lc2013.assertive": 2.07,
+}
+"""The best of 24 sets of `laneweave tune sl2015 --volumes 1000,1600 --duration 300` on the paper's
+road."""
 
 METHODS: Final[dict[str, LabelledMethod]] = {
     "formation": LabelledMethod(FORMATION),
@@ -142,6 +153,7 @@ METHODS: Final[dict[str, LabelledMethod]] = {
     "sl2015": LabelledMethod(LC2013, _SL2015),
     "sl2015-human": LabelledMethod(LC2013, _SUMO_HUMAN | _SL2015),
     "sl2015-ideal": LabelledMethod(LC2013, _SUMO_IDEAL | _SL2015),
+    "sl2015-tuned": LabelledMethod(LC2013, _SL2015_TUNED),
     "sl2015-cooperative": LabelledMethod(LC2013, _SUMO_COOPERATIVE | _SL2015),
 }
 """Built-in methods by label, in the order of tables and figures."""

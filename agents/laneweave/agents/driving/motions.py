@@ -120,7 +120,8 @@ class Motions:
             return  # not a move of this scenario
         table = self._tables.get((dx, dy, ticks))
         if table is None:
-            # A motion does not name the type. Cars drive every move; profiles differ little.
+            # A motion does not name the type. Types that are weaker than cars may drive profiles
+            # up to 1 m away: such an announcement is not matched for half a second.
             table = self._tables[dx, dy, ticks] = _MoveTable.of(self._scenario, dx, dy, ticks)
         start_m, end_m = column * self._pitch_m, to_column * self._pitch_m
         low_m, high_m = min(start_m, end_m) - NEAR_M, max(start_m, end_m) + NEAR_M

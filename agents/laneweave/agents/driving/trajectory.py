@@ -1,10 +1,10 @@
-"""Trajectories between cells: minimum-jerk motions that keep all limits of the vehicle.
+"""Trajectories between cells, within all limits of the vehicle.
 
 In the moving frame a vehicle goes from rest to rest. A minimum-jerk quintic over one cell in 3.8 s
 needs 6 m/s2, more than the vehicle's limit. A move is therefore the solution of a quadratic program
 over n ticks of h seconds,
 
-    minimise    sum_k j_s,k^2 + j_y,k^2
+    minimise    sum_k j_s,k^2 + j_y,k^2 + w a_s,k^2
     subject to  z_{k+1} = A z_k + B u_k,  z_0 = 0,  z_n = (ds, 0, 0, dy, 0, 0)
                 speed, acceleration, jerk and slip within a fraction of the vehicle's limits
 
@@ -22,16 +22,19 @@ with a margin for errors:
 
 for every tick k, with r ticks of reaction time; the square is replaced by its tangents.
 
-Where the duration permits, moves by a column are gentler than that: the cost also contains
-accelerations, brakes and throttle share one limit, and the time to collision with a vehicle that
-holds beyond the target, ahead or behind, stays above a bound tau (`Closing`), which is linear too:
+Where the duration permits, moves by a column are *gentle* (decision 76): w is positive, the vehicle
+brakes no harder than it may accelerate, and its time to collision with a vehicle that holds beyond
+the target, ahead or behind, stays above a bound tau, which is linear too:
 
     |s_k| + tau |v_k|  <=  2 d_F - L
+
+Otherwise w is 0.
 """
 
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from functools import lru_cache, partial
 from typing import Any
 
@@ -46,6 +49,7 @@ from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import displacements
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.vehicle_tables import Vehicle
+from laneweave.protocol.summary import TTC_SHORT_S
 from laneweave.protocol.vehicle.emergency_brake import (
     ERROR_SIGMAS,
     last_tick_m,
@@ -71,16 +75,15 @@ _TRACKING_ERROR_M = 0.25
 _CLOSING_SPEEDUP = 0.5
 """Maximum closing speed that the tangents cover, as a fraction of v_F."""
 _TANGENTS = 5
-MIN_TTC_S = 3.2
-"""Least time to collision of a gentle move: 3 s, below which drivers are considered to be in
-conflict (decision 77), and a margin for tracking errors."""
+MIN_TTC_S = TTC_SHORT_S + 0.2
+"""Minimum time to collision of a gentle move, with a margin for tracking errors."""
 _APPROACH_SHARE = 0.59
-"""Least time to collision of a gentle forward move, as a fraction of the longest possible one. A
+"""Minimum time to collision of a gentle forward move, as a fraction of the longest possible one. A
 vehicle that closes up early brakes for longer, and burns no fuel meanwhile."""
 _ACCEL_WEIGHT = 5.0
 """Cost of squared accelerations relative to squared jerks in gentle moves [1/s2]."""
 _SETTINGS = QPSettings(
-    eps_abs=1e-6,
+    eps_abs=1e-5,  # polishing makes solutions exact
     max_iter=40_000,
     check_termination=25,
     rho=0.3,
@@ -139,7 +142,7 @@ class Envelope:
 
 
 @frozen
-class Closing:
+class TtcBound:
     """Lower bound on the time to collision with a vehicle that holds beyond the target."""
 
     gap_m: float
@@ -148,17 +151,19 @@ class Closing:
     direction: int
     """1: it holds ahead, -1: behind."""
 
-    @classmethod
-    def of(cls, direction: int, gap_m: float, pitch_m: float, duration_s: float) -> Closing:
-        """Return the bound for a move by one column of `pitch_m`.
 
-        The longest possible time to collision is that of a gap which shrinks exponentially.
-        """
-        ttc_s = MIN_TTC_S
-        if direction > 0:
-            longest_s = duration_s / math.log(gap_m / (gap_m - pitch_m))
-            ttc_s = max(MIN_TTC_S, _APPROACH_SHARE * longest_s)
-        return cls(gap_m, ttc_s, direction)
+def _ttc_bounds(dx: int, gap_m: float, pitch_m: float, duration_s: float) -> tuple[TtcBound, ...]:
+    """Return the bounds that a move by `dx` columns should keep, the longest time first.
+
+    The longest possible time to collision is that of a gap which shrinks exponentially.
+    """
+    if dx == 0:
+        return ()
+    longest_s = duration_s / math.log(gap_m / (gap_m - pitch_m))
+    wanted_s = {MIN_TTC_S}
+    if dx > 0:
+        wanted_s.add(max(MIN_TTC_S, _APPROACH_SHARE * longest_s))
+    return tuple(TtcBound(gap_m, ttc_s, dx) for ttc_s in sorted(wanted_s, reverse=True))
 
 
 @lru_cache(maxsize=256)
@@ -166,6 +171,8 @@ def move_profile(
     scenario: Scenario, limits: Vehicle, dx: int, dy: int, ticks: int | None = None
 ) -> Trajectory:
     """Return the move by `dx` columns and `dy` lanes, from rest at the origin; cached per process.
+
+    It is gentle if the limits allow that in the duration, otherwise of minimum jerk.
 
     Args:
         scenario: tick, lattice, sensors and brakes.
@@ -194,12 +201,10 @@ def move_profile(
         dy * scenario.road.lane_width_m,
         Envelope.behind(scenario, limits, beyond_m) if dx > 0 else None,
     )
-    if dx == 0:
-        return plan()
-    try:
-        return plan(Closing.of(dx, beyond_m, pitch_m, ticks * tick_s))
-    except InfeasibleTrajectoryError:
-        return plan()
+    for bound in _ttc_bounds(dx, beyond_m, pitch_m, ticks * tick_s):
+        with suppress(InfeasibleTrajectoryError):
+            return plan(bound)
+    return plan()
 
 
 def check_moves(scenario: Scenario) -> None:
@@ -245,9 +250,9 @@ def plan_trajectory(
     ds_m: float,
     dy_m: float,
     envelope: Envelope | None = None,
-    closing: Closing | None = None,
+    ttc_bound: TtcBound | None = None,
 ) -> Trajectory:
-    """Return the minimum-jerk trajectory from rest at (0, 0) to rest at (ds, dy); cached.
+    """Return the trajectory of minimum cost from rest at (0, 0) to rest at (ds, dy); cached.
 
     Args:
         limits: the vehicle's limits.
@@ -257,7 +262,7 @@ def plan_trajectory(
         ds_m: distance along the road, relative to the lattice.
         dy_m: distance across the road.
         envelope: bound that leaves room to brake; None: no bound.
-        closing: a gentle move with this bound; None: minimum jerk, and no bound.
+        ttc_bound: bound of a gentle move; None: minimum jerk.
 
     Raises:
         InfeasibleTrajectoryError: there is no trajectory within the limits.
@@ -268,7 +273,7 @@ def plan_trajectory(
     # A unit of time of an eighth of the duration gives all states similar magnitudes.
     unit_s = ticks * tick_s / 8.0
     program = _trajectory_program(
-        limits, speed_mps, tick_s / unit_s, unit_s, ticks, (ds_m, dy_m), envelope, closing
+        limits, speed_mps, tick_s / unit_s, unit_s, ticks, (ds_m, dy_m), envelope, ttc_bound
     )
     what = f"{ds_m:g} m along and {dy_m:g} m across in {ticks * tick_s:g} s"
     if envelope is not None:
@@ -282,7 +287,7 @@ def plan_trajectory(
     jerks = solution.x[6 * ticks :].reshape(2, ticks).T / unit_s**3
     trajectory = _integrated(jerks, tick_s)
     end_error = np.abs(trajectory.states[-1] - (ds_m, 0.0, 0.0, dy_m, 0.0, 0.0)).max()
-    excess = _excess(trajectory, limits, speed_mps)
+    excess = _excess(trajectory, limits, speed_mps, ttc_bound)
     if not (end_error < _END_TOLERANCE and excess < _LIMIT_TOLERANCE):
         raise InfeasibleTrajectoryError(
             f"{what}: the best trajectory misses its end by {end_error:.2g} and a limit by "
@@ -299,13 +304,13 @@ def _trajectory_program(
     n: int,
     end_m: tuple[float, float],
     envelope: Envelope | None,
-    closing: Closing | None,
+    ttc_bound: TtcBound | None,
 ) -> QuadraticProgram:
     """Return the program in units of `unit_s`: x = (z_s [3n], z_y [3n], j_s [n], j_y [n])."""
-    constraints = _constraints(limits, speed_mps, h, unit_s, n, envelope, closing)
+    constraints = _constraints(limits, speed_mps, h, unit_s, n, envelope, ttc_bound)
     lower, upper = constraints.lower.copy(), constraints.upper.copy()
     lower[constraints.ends] = upper[constraints.ends] = [end_m[0], 0.0, 0.0, end_m[1], 0.0, 0.0]
-    cost = _cost(n, 0.0 if closing is None else _ACCEL_WEIGHT * unit_s**2)
+    cost = _cost(n, 0.0 if ttc_bound is None else _ACCEL_WEIGHT * unit_s**2)
     return QuadraticProgram(cost, constraints.matrix, lower, upper, settings=_SETTINGS)
 
 
@@ -326,7 +331,7 @@ class _Constraints:
     """Rows of z_n, whose bounds are 0."""
 
 
-@lru_cache(maxsize=4)  # with and without the two bounds, for one duration after another
+@lru_cache(maxsize=8)  # all bounds, for one duration after another
 def _constraints(
     limits: Vehicle,
     speed_mps: float,
@@ -334,7 +339,7 @@ def _constraints(
     unit_s: float,
     n: int,
     envelope: Envelope | None,
-    closing: Closing | None = None,
+    ttc_bound: TtcBound | None,
 ) -> _Constraints:
     """Return the constraints that all trajectories of one duration share; cached."""
     transition, effect = axis_matrices(h)
@@ -383,12 +388,11 @@ def _constraints(
             row = sparse.kron(later, np.array([[1.0, speed / brake / unit_s, 0.0]]))
             max_m = envelope.max_m - speed * (2.0 * speed_mps - speed) / (2.0 * brake)
             rows.append(([row, None, None, None], -infinite, max_m))
-    if closing is not None:
-        # The last state is at rest, so its bound is that of the gap that remains.
-        row = closing.direction * sparse.kron(eye, np.array([[1.0, closing.ttc_s / unit_s, 0.0]]))
-        rows.append(([row, None, None, None], -infinite, closing.gap_m))
-        braking_mps2 = min(limits.max_accel_mps2, -limits.min_accel_mps2)
-        rows.append(([pick(2), None, None, None], -a_unit * braking_mps2, infinite))
+    if ttc_bound is not None:
+        way = np.array([[1.0, ttc_bound.ttc_s / unit_s, 0.0]])
+        row = ttc_bound.direction * sparse.kron(eye, way)
+        rows.append(([row, None, None, None], -infinite, ttc_bound.gap_m))
+        rows.append(([pick(2), None, None, None], -a_unit * _gentle_brake_mps2(limits), infinite))
     heights = [next(m for m in blocks if m is not None).shape[0] for blocks, _, _ in rows]
     end = sum(heights[:ends_after])
     return _Constraints(
@@ -397,6 +401,11 @@ def _constraints(
         np.concatenate([np.full(m, high) for m, (_, _, high) in zip(heights, rows, strict=True)]),
         slice(end - 6, end),
     )
+
+
+def _gentle_brake_mps2(limits: Vehicle) -> float:
+    """Return the hardest braking of gentle moves: no harder than the vehicle may accelerate."""
+    return min(limits.max_accel_mps2, -limits.min_accel_mps2)
 
 
 def _both(limit: float) -> tuple[float, float]:
@@ -444,7 +453,7 @@ def _settling_program(
     Its units are those of `_trajectory_program`.
     """
     unit_s = n * tick_s / 8.0
-    constraints = _constraints(limits, speed_mps, tick_s / unit_s, unit_s, n, None)
+    constraints = _constraints(limits, speed_mps, tick_s / unit_s, unit_s, n, None, None)
     lower, upper = constraints.lower.copy(), constraints.upper.copy()
     transition, _ = axis_matrices(tick_s / unit_s)
     units = np.array([1.0, unit_s, unit_s**2])
@@ -490,22 +499,33 @@ def _integrated(jerks: Array, tick_s: float, start: Array | None = None) -> Traj
     return Trajectory(states, jerks)
 
 
-def _excess(trajectory: Trajectory, limits: Vehicle, speed_mps: float) -> float:
-    """Return the maximum excess over `LIMIT_SHARE` of a limit [m/s, m/s2, m/s3]; NaN propagates."""
-    _, v, a, _, v_y, a_y = trajectory.states.T
+def _excess(
+    trajectory: Trajectory,
+    limits: Vehicle,
+    speed_mps: float,
+    ttc_bound: TtcBound | None = None,
+) -> float:
+    """Return the maximum excess over `LIMIT_SHARE` of a limit [m/s, m/s2, m/s3]; NaN propagates.
+
+    That over the bound of the time to collision is in m.
+    """
+    s, v, a, _, v_y, a_y = trajectory.states.T
     jerk = np.abs(trajectory.jerks).max(axis=0)
     share = LIMIT_SHARE
-    return float(
-        np.max(
-            [
-                (-v - share * speed_mps).max(),
-                (v - share * (limits.max_speed_mps - speed_mps)).max(),
-                (share * limits.min_accel_mps2 - a).max(),
-                (a - share * limits.max_accel_mps2).max(),
-                (np.abs(a_y) - share * limits.max_lateral_accel_mps2).max(),
-                (np.abs(v_y) - share * limits.max_slip_ratio * (speed_mps + v)).max(),
-                jerk[0] - share * limits.max_jerk_mps3,
-                jerk[1] - share * limits.max_lateral_jerk_mps3,
-            ]
-        )
-    )
+    excesses = [
+        (-v - share * speed_mps).max(),
+        (v - share * (limits.max_speed_mps - speed_mps)).max(),
+        (share * limits.min_accel_mps2 - a).max(),
+        (a - share * limits.max_accel_mps2).max(),
+        (np.abs(a_y) - share * limits.max_lateral_accel_mps2).max(),
+        (np.abs(v_y) - share * limits.max_slip_ratio * (speed_mps + v)).max(),
+        jerk[0] - share * limits.max_jerk_mps3,
+        jerk[1] - share * limits.max_lateral_jerk_mps3,
+    ]
+    if ttc_bound is not None:
+        way_m = ttc_bound.direction * (s + ttc_bound.ttc_s * v)
+        excesses += [
+            (way_m - ttc_bound.gap_m).max(),
+            (-share * _gentle_brake_mps2(limits) - a).max(),
+        ]
+    return float(np.max(excesses))

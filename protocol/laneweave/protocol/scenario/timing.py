@@ -15,10 +15,10 @@ from laneweave.protocol.scenario.vehicle_tables import PEAK_ACCEL, Vehicle
 SHORTEST_CYCLE_S, LONGEST_CYCLE_S = 4.0, 7.0
 """Range of T_F if `formation.cycle_s` is not set; the lower end is the paper's value."""
 GENTLE_MPS2 = 3.0
-"""Maximum acceleration of moves within the comfortable T_F, along and across the road."""
-ROLLING_CYCLES_S = {2000.0: 6.0, 2200.0: 5.4, math.inf: 4.6}
-"""T_F of the rolling operation up to each volume [vehicles/(lane h)]; denser traffic needs more
-steps on the same road (decision 76)."""
+"""Maximum acceleration of minimum-jerk moves within the comfortable T_F."""
+ROLLING_CYCLES_S = ((2000.0, 6.0), (2200.0, 5.4), (math.inf, 4.6))
+"""Volumes [vehicles/(lane h)] in ascending order, and T_F [s] of the rolling operation up to each;
+denser traffic needs more steps on the same road (decision 76)."""
 MIN_MERGING_SLOTS = 4
 """Number of slots that the rolling operation should have in a lane that begins and ends on the
 road, as that of a ramp; with three, up to 1 % of the vehicles did not change lanes in time at 2000
@@ -49,7 +49,8 @@ class Timing:
             return cycle_s, cycle_s
         if self._formation.traits.common_slots:
             volume = self._volume_veh_per_lane_h
-            cycle_s = next(value for most, value in ROLLING_CYCLES_S.items() if volume <= most)
+            cycle_s = next(one_s for max_volume, one_s in ROLLING_CYCLES_S if volume <= max_volume)
+            cycle_s = max(cycle_s, self._shortest_cycle_s)
             longest_s = self._shortest_merging_s / MIN_MERGING_SLOTS
             if cycle_s > longest_s:
                 steps = math.floor(longest_s / CYCLE_STEP_S + 1e-9)
@@ -97,7 +98,10 @@ class Timing:
 
     @property
     def comfortable_cycle_s(self) -> float:
-        """Shortest T_F [s] in which no move exceeds `GENTLE_MPS2`, or the longest."""
+        """Shortest T_F [s] in which no minimum-jerk move exceeds `GENTLE_MPS2`, or the longest.
+
+        Moves that keep a time to collision may need a little more where columns are short.
+        """
         formation = self._formation
         min_s = math.sqrt(PEAK_ACCEL * formation.gap_m / GENTLE_MPS2)
         comfortable = [slot_s for slot_s in self.slots_s if slot_s >= min_s + formation.slack_s]

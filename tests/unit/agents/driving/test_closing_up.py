@@ -7,16 +7,19 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
+from laneweave.agents.driving.qp_solver import SOLVED, QPResult, QuadraticProgram
 from laneweave.agents.driving.trajectory import (
     _TRACKING_ERROR_M,
     MIN_TTC_S,
+    Envelope,
     Trajectory,
     check_moves,
     move_profile,
+    plan_trajectory,
 )
 from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.errors import BadInputError
-from laneweave.protocol.lattice import Cell
+from laneweave.protocol.lattice import Cell, displacements
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.emergency_brake import ERROR_SIGMAS, EmergencyBrake, spare_error_m
 from laneweave.protocol.vehicle.motion import Jerk, cell_state
@@ -133,10 +136,53 @@ def test_forward_moves_close_up_early() -> None:
     assert (ahead[:, 2] < 0.0).sum() > (ahead[:, 2] > 0.0).sum()
 
 
-def test_moves_in_the_papers_slots_are_those_of_minimum_jerk() -> None:
+@pytest.mark.parametrize("dx", [-1, 1])
+def test_moves_in_the_papers_slots_are_those_of_minimum_jerk(dx: int) -> None:
     """They cannot be gentle within the limits."""
-    fastest = profile_of(-1, 0, 4.0).states
-    assert abs(fastest[:, 1]).max() > 1.85 * SCENARIO.formation.gap_m / 3.8
+    pitch_m, gap_m = SCENARIO.formation.gap_m, 2.0 * SCENARIO.formation.gap_m - LIMITS.length_m
+    envelope = Envelope.behind(SCENARIO, LIMITS, gap_m) if dx > 0 else None
+    fastest = plan_trajectory(LIMITS, V_F, TICK_S, 38, dx * pitch_m, 0.0, envelope)
+    assert (profile_of(dx, 0, 4.0).states == fastest.states).all()
+
+
+def test_moves_keep_what_the_limits_allow() -> None:
+    """3.2 s where the longer time to collision of forward moves is impossible, or minimum jerk."""
+    stiff = parse_scenario(
+        {
+            "formation": {"gap_m": 20.0, "speed_mps": 20.0, "cycle_s": 5.0},
+            "vehicle": {"max_jerk_mps3": 10.0, "max_speed_mps": 30.0},
+        }
+    )
+    assert min_ttc_s(stiff, 1) == pytest.approx(MIN_TTC_S, abs=0.01)
+    assert min_ttc_s(parse_scenario({"formation": {"gap_m": 20.0, "cycle_s": 4.6}}), -1) < 2.9
+
+
+def min_ttc_s(scenario: Scenario, dx: int) -> float:
+    """Return the time to collision of a planned move with a vehicle that holds beyond."""
+    _, v, *_ = (states := move_profile(scenario, scenario.vehicle, dx, 0).states).T
+    gaps_m = 2.0 * scenario.formation.gap_m - scenario.vehicle.length_m - np.abs(states[:, 0])
+    return float((gaps_m[1:-1] / np.abs(v[1:-1])).min())
+
+
+def test_profiles_are_found_far_below_the_iteration_limit(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Solvers of other builds may need more iterations."""
+    found: list[QPResult] = []
+    solve = QuadraticProgram.solve
+
+    def counted(program: QuadraticProgram) -> QPResult:
+        found.append(solve(program))
+        return found[-1]
+
+    monkeypatch.setattr(QuadraticProgram, "solve", counted)
+    for cached in (move_profile, plan_trajectory):
+        cached.cache_clear()
+    for slot_s in (4.6, 5.4, 6.0):
+        for dx, dy in displacements(2)[1:]:
+            profile_of(dx, dy, slot_s)
+    assert all(one.status == SOLVED for one in found)
+    assert max(one.iterations for one in found) < 20_000
 
 
 @pytest.mark.parametrize(
