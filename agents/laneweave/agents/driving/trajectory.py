@@ -33,7 +33,6 @@ Otherwise w is 0.
 
 from __future__ import annotations
 
-import math
 from contextlib import suppress
 from functools import lru_cache, partial
 from typing import Any
@@ -43,21 +42,13 @@ from attrs import frozen
 from numpy.typing import NDArray
 from scipy import sparse
 
+from laneweave.agents.driving.move_bounds import CLOSING_SPEEDUP, Envelope, TtcBound, ttc_bounds
 from laneweave.agents.driving.qp_solver import MAX_ITERATIONS, QPSettings, QuadraticProgram
 from laneweave.agents.driving.regulator import axis_matrices
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import displacements
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.vehicle_tables import Vehicle
-from laneweave.protocol.summary import TTC_SHORT_S
-from laneweave.protocol.vehicle.emergency_brake import (
-    ERROR_SIGMAS,
-    last_tick_m,
-    lead_lag_s,
-    lead_path_m,
-    own_braking_mps2,
-    spare_error_m,
-)
 from laneweave.protocol.wire.messages import CAR
 
 Array = NDArray[np.float64]
@@ -70,16 +61,7 @@ _LIMIT_TOLERANCE = 1e-4
 """Maximum excess over `LIMIT_SHARE` of a limit [m/s, m/s2, m/s3]."""
 _MAX_BEHIND_M = 0.4
 """Maximum distance of a settling vehicle behind its cell; the room beyond is that of others."""
-_TRACKING_ERROR_M = 0.25
-"""Margin for tracking errors behind the vehicle ahead."""
-_CLOSING_SPEEDUP = 0.5
-"""Maximum closing speed that the tangents cover, as a fraction of v_F."""
 _TANGENTS = 5
-MIN_TTC_S = TTC_SHORT_S + 0.2
-"""Minimum time to collision of a gentle move, with a margin for tracking errors."""
-_APPROACH_SHARE = 0.59
-"""Minimum time to collision of a gentle forward move, as a fraction of the longest possible one. A
-vehicle that closes up early brakes for longer, and burns no fuel meanwhile."""
 _ACCEL_WEIGHT = 5.0
 """Cost of squared accelerations relative to squared jerks in gentle moves [1/s2]."""
 _SETTINGS = QPSettings(
@@ -112,58 +94,6 @@ class Trajectory:
     def ticks(self) -> int:
         """Duration n [ticks]."""
         return len(self.jerks)
-
-
-@frozen
-class Envelope:
-    """Bound on position and speed that leaves room to brake behind a vehicle that holds."""
-
-    ticks: int
-    """Reaction time [ticks]."""
-    brake_mps2: float
-    max_m: float
-    """Upper bound of s + (v_F + v)^2 / (2 brake), with s and v relative to the lattice."""
-
-    @classmethod
-    def behind(cls, scenario: Scenario, limits: Vehicle, gap_m: float) -> Envelope:
-        """Return the envelope for a move that starts with a net gap of `gap_m` to the vehicle."""
-        speed_mps, braking = scenario.formation.speed_mps, scenario.braking
-        ticks = max(round(braking.reaction_s / scenario.runtime.tick_s), 1)
-        lost_s = limits.actuator_lag_s + ticks * scenario.runtime.tick_s
-        closing_mps = (1.0 + _CLOSING_SPEEDUP) * speed_mps
-        errors_m = ERROR_SIGMAS * spare_error_m(
-            limits, braking, scenario.sensing, closing_mps, speed_mps
-        )
-        brake_mps2, tick_s = own_braking_mps2(limits, braking), scenario.runtime.tick_s
-        kept_m = braking.margin_m + errors_m + _TRACKING_ERROR_M + last_tick_m(brake_mps2, tick_s)
-        lead_m = lead_path_m(speed_mps, 0.0, braking.lead_brake_mps2, lead_lag_s(limits, braking))
-        max_m = gap_m + lead_m - kept_m - lost_s * speed_mps
-        return cls(ticks, brake_mps2, max_m)
-
-
-@frozen
-class TtcBound:
-    """Lower bound on the time to collision with a vehicle that holds beyond the target."""
-
-    gap_m: float
-    """Net gap to that vehicle at the start of the move."""
-    ttc_s: float
-    direction: int
-    """1: it holds ahead, -1: behind."""
-
-
-def _ttc_bounds(dx: int, gap_m: float, pitch_m: float, duration_s: float) -> tuple[TtcBound, ...]:
-    """Return the bounds that a move by `dx` columns should keep, the longest time first.
-
-    The longest possible time to collision is that of a gap which shrinks exponentially.
-    """
-    if dx == 0:
-        return ()
-    longest_s = duration_s / math.log(gap_m / (gap_m - pitch_m))
-    wanted_s = {MIN_TTC_S}
-    if dx > 0:
-        wanted_s.add(max(MIN_TTC_S, _APPROACH_SHARE * longest_s))
-    return tuple(TtcBound(gap_m, ttc_s, dx) for ttc_s in sorted(wanted_s, reverse=True))
 
 
 @lru_cache(maxsize=256)
@@ -201,7 +131,7 @@ def move_profile(
         dy * scenario.road.lane_width_m,
         Envelope.behind(scenario, limits, beyond_m) if dx > 0 else None,
     )
-    for bound in _ttc_bounds(dx, beyond_m, pitch_m, ticks * tick_s):
+    for bound in ttc_bounds(dx, beyond_m, pitch_m, ticks * tick_s):
         with suppress(InfeasibleTrajectoryError):
             return plan(bound)
     return plan()
@@ -382,7 +312,7 @@ def _constraints(
     ends_after = len(rows)
     if envelope is not None:
         brake, later = envelope.brake_mps2, eye.tocsr()[envelope.ticks - 1 :]
-        for share in np.linspace(0.0, _CLOSING_SPEEDUP, _TANGENTS):
+        for share in np.linspace(0.0, CLOSING_SPEEDUP, _TANGENTS):
             speed = speed_mps * (1.0 + share)
             # At this speed: v^2 / (2 b) >= speed (2 v - speed) / (2 b).
             row = sparse.kron(later, np.array([[1.0, speed / brake / unit_s, 0.0]]))

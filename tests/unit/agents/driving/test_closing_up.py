@@ -7,11 +7,9 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
+from laneweave.agents.driving.move_bounds import MIN_TTC_S, TRACKING_ERROR_M, Envelope
 from laneweave.agents.driving.qp_solver import SOLVED, QPResult, QuadraticProgram
 from laneweave.agents.driving.trajectory import (
-    _TRACKING_ERROR_M,
-    MIN_TTC_S,
-    Envelope,
     Trajectory,
     check_moves,
     move_profile,
@@ -34,7 +32,7 @@ SLOTS_S = (4.0, 4.6, 5.4, 6.0, 7.0)
 MOVES = [(dx, dy) for dx in (-1, 0, 1) for dy in (-1, 0, 1)]
 BRAKE = EmergencyBrake(LIMITS, SCENARIO.braking, TICK_S)
 ERROR_M = spare_error_m(LIMITS, SCENARIO.braking, SCENARIO.sensing, 1.5 * V_F, V_F)
-PROMISED_M = ERROR_SIGMAS * ERROR_M + _TRACKING_ERROR_M
+PROMISED_M = ERROR_SIGMAS * ERROR_M + TRACKING_ERROR_M
 """What moves forwards leave beyond the margin."""
 
 
