@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Mapping
 from typing import Final
 
 from evaluation.evidence import Evidence
-from evaluation.intervals import Difference, Verdict, difference
+from evaluation.intervals import MIN_SEEDS, Difference, Verdict, difference
 from evaluation.markdown import MISSING, NOT_RUN, markdown, number
 from evaluation.points import PointRow
 from evaluation.programme import FORMATIONS, LABELS, VOLUMES, planned
@@ -25,6 +26,11 @@ WORDS: Final = {
     Verdict.UNKNOWN: "not compared with",
 }
 """What a difference of travel times means, in the order of the sentences."""
+_MEANING: Final = {
+    Verdict.LESS: "less",
+    Verdict.MORE: "**more**",
+    Verdict.NONE: "not different",
+}
 
 
 def comparison(evidence: Evidence) -> str:
@@ -60,13 +66,18 @@ def tuned_comparison(evidence: Evidence) -> str:
         "minimum time to collision [s]", "vehicles that brake harder than 5 m/s2, per run",
         "CO2, petrol [g/km]",
     )  # fmt: skip
-    sentences = [
-        f"- At {volume:g}, `{own}` against `{other}`: {differences}."
-        for volume in VOLUMES
-        for own in OWN
-        for other in TUNED
-        if volume >= FROM_VOLUME and (differences := _against(evidence, own, other, volume))
-    ]
+    sentences, without = [], dict[str, None]()
+    for volume in VOLUMES:
+        for own, other in itertools.product(OWN, TUNED):
+            words = _against(evidence, own, other, volume) if volume >= FROM_VOLUME else None
+            if words:
+                sentences.append(f"- At {volume:g}, `{own}` against `{other}`: {words}.")
+            elif words is not None:
+                without[f"{volume:g}"] = None
+    if without:
+        sentences.append(
+            f"- Without intervals, for which {MIN_SEEDS} seeds are necessary: {', '.join(without)}."
+        )
     return "\n\n".join([markdown(headings, rows), "\n".join(sentences) or MISSING])
 
 
@@ -84,8 +95,11 @@ def _figures(row: PointRow) -> list[str]:
     ]
 
 
-def _against(evidence: Evidence, own: str, other: str, volume: float) -> str:
-    """Return the differences of travel time and CO2 in words; empty: there are none."""
+def _against(evidence: Evidence, own: str, other: str, volume: float) -> str | None:
+    """Return the differences of travel time and CO2 in words; empty: there are no intervals.
+
+    None: a method has no run there, or one of the figures is unknown.
+    """
     words = []
     for figure, name, unit in (
         ("travel_s", "travel time", "s"),
@@ -93,11 +107,13 @@ def _against(evidence: Evidence, own: str, other: str, volume: float) -> str:
     ):
         found = _difference(evidence, own, other, volume, figure)
         if found is None:
-            continue
-        known = "too few runs for an interval"
+            return None
         if found.bounds is not None:
-            known = f"95 % interval {found.bounds.low:+.2f} to {found.bounds.high:+.2f}"
-        words.append(f"{name} {found.mean:+.2f} {unit} ({known})")
+            low, high = found.bounds
+            words.append(
+                f"{name} {_MEANING[found.verdict]} ({found.mean:+.2f} {unit}, "
+                f"{low:+.2f} to {high:+.2f})"
+            )
     return ", ".join(words)
 
 

@@ -51,7 +51,8 @@ PARTS: Final = (
     Part(("rule", "rule-yielding"), _up_to(1800.0), KeepTrajectories.first_seed),
     Part(("rule-net",), _up_to(1600.0), KeepTrajectories.first_seed),
     Part(("lc2013", "lc2013-4s"), _up_to(1800.0), KeepTrajectories.first_seed),
-    Part(("lc2013-tuned", "sl2015-tuned"), VOLUMES, KeepTrajectories.first_seed),
+    Part(("lc2013-tuned",), VOLUMES, KeepTrajectories.first_seed),
+    Part(("sl2015-tuned",), _up_to(2200.0), KeepTrajectories.first_seed),
 )
 """Longest runs first, so that short ones fill the idle cores at the end."""
 LABELS: Final = (

@@ -301,13 +301,10 @@ def test_operations_are_compared_with_tuned_drivers() -> None:
     assert len(table.splitlines()) == 6
     exact, unknown = sentences.splitlines()
     assert exact == (
-        "- At 1000, `formations` against `lc2013-tuned`: travel time -1.00 s "
-        "(95 % interval -1.00 to -1.00), CO2 +2.00 g/km (95 % interval +2.00 to +2.00)."
+        "- At 1000, `formations` against `lc2013-tuned`: travel time less "
+        "(-1.00 s, -1.00 to -1.00), CO2 **more** (+2.00 g/km, +2.00 to +2.00)."
     )
-    assert unknown == (
-        "- At 1600, `rolling` against `lc2013-tuned`: travel time +0.00 s (too few runs for an "
-        "interval), CO2 +0.00 g/km (too few runs for an interval)."
-    )
+    assert unknown == "- Without intervals, for which 10 seeds are necessary: 1600."
 
 
 def test_intervals() -> None:
