@@ -55,11 +55,12 @@ def _of_one(evidence: Evidence, label: str) -> str:
 
 def tuned_comparison(evidence: Evidence) -> str:
     """Return the figures of both operations beside tuned drivers, and a sentence for each pair."""
+    volumes = [volume for volume in VOLUMES if volume >= FROM_VOLUME]
     rows = [
         _figures(evidence.by_key[label, volume])
-        for volume in VOLUMES
+        for volume in volumes
         for label in (*OWN, *TUNED)
-        if volume >= FROM_VOLUME and (label, volume) in evidence.by_key
+        if (label, volume) in evidence.by_key
     ]
     headings = (
         "veh/(lane h)", "method", "runs", "travel time [s]", "below 3 s to collision [s per run]",
@@ -67,13 +68,12 @@ def tuned_comparison(evidence: Evidence) -> str:
         "CO2, petrol [g/km]",
     )  # fmt: skip
     sentences, without = [], dict[str, None]()
-    for volume in VOLUMES:
-        for own, other in itertools.product(OWN, TUNED):
-            words = _against(evidence, own, other, volume) if volume >= FROM_VOLUME else None
-            if words:
-                sentences.append(f"- At {volume:g}, `{own}` against `{other}`: {words}.")
-            elif words is not None:
-                without[f"{volume:g}"] = None
+    for volume, own, other in itertools.product(volumes, OWN, TUNED):
+        words = _against(evidence, own, other, volume)
+        if words:
+            sentences.append(f"- At {volume:g}, `{own}` against `{other}`: {words}.")
+        elif words is not None:
+            without[f"{volume:g}"] = None
     if without:
         sentences.append(
             f"- Without intervals, for which {MIN_SEEDS} seeds are necessary: {', '.join(without)}."
