@@ -161,6 +161,7 @@ def missing(road: StreamRoad, slot: int, vehicle: StreamVehicle) -> float:
 def step_cost(road: StreamRoad, slot: int, vehicle: StreamVehicle, move: Move) -> float:
     cost = COSTS.off_lane * off_target(road, slot, vehicle, move[0])
     cost += COSTS.move * (move[0] != move[1])
+    cost += COSTS.forward * (move[1][0] > move[0][0])
     return cost + COSTS.backward * (move[1][0] < move[0][0])
 
 

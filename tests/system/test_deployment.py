@@ -13,7 +13,7 @@ import pytest
 from laneweave.protocol.runtime.transport import Delivery, TokenUp
 from laneweave.protocol.security.connection import Access
 from laneweave.protocol.transports.zenoh.transport import ZenohTransport
-from laneweave.protocol.wire.topics import BRIDGE_ALIVE, Keys
+from laneweave.protocol.wire.topics import BRIDGE_ALIVE, PROCESS_ALIVE, Keys
 from support.deployments import REALM, ask, deployment, free_tcp, ping, start_router, stop
 from support.extras import only_for
 from support.harness import END_S, RUN_S, Lab, check_safe_and_complete, events, final_lanes, summary
@@ -124,11 +124,17 @@ def test_the_bridge_ends_while_it_waits_for_agents(lab: Lab) -> None:
 
 @pytest.mark.more
 def test_roles_end_while_the_router_is_away(lab: Lab) -> None:
-    config = deployment(lab, free_tcp())
+    endpoint = free_tcp()
+    config = deployment(lab, endpoint)
+    tokens: queue.SimpleQueue[Delivery] = queue.SimpleQueue()
     router = start_router(lab, config)
     coordinator = lab.start("coordinator", "--config", config)
     agent = lab.start("agent", "--config", config)
     lab.wait_until(lambda: ask(lab, config, REQUEST).status == 0, END_S)
+    with contextlib.closing(ZenohTransport(Access(endpoint), tokens.put)) as transport:
+        transport.watch(Keys(REALM).all_of(PROCESS_ALIVE))
+        for _ in (coordinator, agent):
+            assert isinstance(tokens.get(timeout=END_S), TokenUp)
     router.kill()
     router.wait(END_S)
 

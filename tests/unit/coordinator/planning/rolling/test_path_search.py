@@ -447,20 +447,21 @@ def test_an_optimal_plan_is_kept_without_a_round() -> None:
 
 @pytest.mark.more
 @pytest.mark.slow
-@pytest.mark.parametrize("count", [5, 2, 7, 9])
-def test_streams_cost_the_minimum_nearly_always(count: int) -> None:
+def test_streams_cost_the_minimum_nearly_always() -> None:
     """The least cost: a mixed-integer programme."""
-    random = Random(3)
-    equal = 0
-    for seed in range(6):
-        vehicles = random.sample(dense(random, range(3), 1.0, SHORT), count)
-        plan = StreamPlanner(SHORT, seed=seed).plan(0, vehicles)
-        assert is_legal(SHORT, plan, vehicles)
-        cost = oracle.cost_of_plan(SHORT, plan, vehicles)
-        least = oracle.Programme(SHORT, 0, vehicles).least_cost()
-        assert cost >= least - 1e-6
-        equal += cost <= least + 1e-6
-    assert equal >= 4
+    costs, least = [], []
+    for count in (2, 5, 7, 9):
+        random = Random(3)
+        for seed in range(18):
+            vehicles = random.sample(dense(random, range(3), 1.0, SHORT), count)
+            plan = StreamPlanner(SHORT, seed=seed).plan(0, vehicles)
+            assert is_legal(SHORT, plan, vehicles)
+            costs.append(oracle.cost_of_plan(SHORT, plan, vehicles))
+            least.append(oracle.Programme(SHORT, 0, vehicles).least_cost())
+    excess = np.array(costs) - np.array(least)
+    assert excess.min() >= -1e-6
+    assert (excess <= 1e-6).mean() >= 0.75
+    assert excess.sum() <= 0.05 * sum(least)
 
 
 def test_ejection_chains_solve_streams_that_reorderings_do_not() -> None:
