@@ -75,7 +75,6 @@ def ttc_bounds(dx: int, gap_m: float, pitch_m: float, duration_s: float) -> tupl
     if dx == 0:
         return ()
     longest_s = duration_s / math.log(gap_m / (gap_m - pitch_m))
-    wanted_s = {MIN_TTC_S}
-    if dx > 0:
-        wanted_s.add(max(MIN_TTC_S, _APPROACH_SHARE * longest_s))
-    return tuple(TtcBound(gap_m, ttc_s, dx) for ttc_s in sorted(wanted_s, reverse=True))
+    approach_s = max(MIN_TTC_S, _APPROACH_SHARE * longest_s) if dx > 0 else MIN_TTC_S
+    times_s = sorted({approach_s, MIN_TTC_S}, reverse=True)
+    return tuple(TtcBound(gap_m, ttc_s, dx) for ttc_s in times_s)

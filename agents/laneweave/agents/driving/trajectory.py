@@ -121,8 +121,7 @@ def move_profile(
         ticks = scenario.timing.move_ticks(scenario.timing.cycles_s[0])
     pitch_m, tick_s = scenario.formation.gap_m, scenario.runtime.tick_s
     beyond_m = 2.0 * pitch_m - scenario.types.longest_body_m
-    plan = partial(
-        plan_trajectory,
+    return plan_trajectory(
         limits,
         scenario.formation.speed_mps,
         tick_s,
@@ -130,11 +129,8 @@ def move_profile(
         dx * pitch_m,
         dy * scenario.road.lane_width_m,
         Envelope.behind(scenario, limits, beyond_m) if dx > 0 else None,
+        ttc_bounds(dx, beyond_m, pitch_m, ticks * tick_s),
     )
-    for bound in ttc_bounds(dx, beyond_m, pitch_m, ticks * tick_s):
-        with suppress(InfeasibleTrajectoryError):
-            return plan(bound)
-    return plan()
 
 
 def check_moves(scenario: Scenario) -> None:
@@ -180,9 +176,11 @@ def plan_trajectory(
     ds_m: float,
     dy_m: float,
     envelope: Envelope | None = None,
-    ttc_bound: TtcBound | None = None,
+    bounds: tuple[TtcBound, ...] = (),
 ) -> Trajectory:
-    """Return the trajectory of minimum cost from rest at (0, 0) to rest at (ds, dy); cached.
+    """Return the trajectory of minimum cost from rest at (0, 0) to rest at (ds, dy).
+
+    The cache contains the choice of the bound, so that infeasible bounds are tried only once.
 
     Args:
         limits: the vehicle's limits.
@@ -192,7 +190,8 @@ def plan_trajectory(
         ds_m: distance along the road, relative to the lattice.
         dy_m: distance across the road.
         envelope: bound that leaves room to brake; None: no bound.
-        ttc_bound: bound of a gentle move; None: minimum jerk.
+        bounds: bounds of a gentle move, in the order in which they are tried; if none of them is
+            feasible, the trajectory is of minimum jerk.
 
     Raises:
         InfeasibleTrajectoryError: there is no trajectory within the limits.
@@ -200,10 +199,32 @@ def plan_trajectory(
     """
     if ds_m == 0.0 and dy_m == 0.0:
         return _integrated(np.zeros((ticks, 2)), tick_s)
+    plan = partial(_planned, limits, speed_mps, tick_s, ticks, (ds_m, dy_m), envelope)
+    for bound in bounds:
+        with suppress(InfeasibleTrajectoryError):
+            return plan(bound)
+    return plan(None)
+
+
+def _planned(
+    limits: Vehicle,
+    speed_mps: float,
+    tick_s: float,
+    ticks: int,
+    end_m: tuple[float, float],
+    envelope: Envelope | None,
+    ttc_bound: TtcBound | None,
+) -> Trajectory:
+    """Return the trajectory with a bound on the time to collision; None: of minimum jerk.
+
+    Raises:
+        InfeasibleTrajectoryError, ValueError: as in `plan_trajectory`.
+    """
+    ds_m, dy_m = end_m
     # A unit of time of an eighth of the duration gives all states similar magnitudes.
     unit_s = ticks * tick_s / 8.0
     program = _trajectory_program(
-        limits, speed_mps, tick_s / unit_s, unit_s, ticks, (ds_m, dy_m), envelope, ttc_bound
+        limits, speed_mps, tick_s / unit_s, unit_s, ticks, end_m, envelope, ttc_bound
     )
     what = f"{ds_m:g} m along and {dy_m:g} m across in {ticks * tick_s:g} s"
     if envelope is not None:
@@ -437,7 +458,7 @@ def _excess(
 ) -> float:
     """Return the maximum excess over `LIMIT_SHARE` of a limit [m/s, m/s2, m/s3]; NaN propagates.
 
-    That over the bound of the time to collision is in m.
+    The excess over the bound on the time to collision is a distance [m].
     """
     s, v, a, _, v_y, a_y = trajectory.states.T
     jerk = np.abs(trajectory.jerks).max(axis=0)

@@ -100,7 +100,7 @@ class Timing:
     def comfortable_cycle_s(self) -> float:
         """Shortest T_F [s] in which no minimum-jerk move exceeds `GENTLE_MPS2`, or the longest.
 
-        Moves that keep a time to collision may need a little more where columns are short.
+        Gentle moves (decision 76) may exceed it slightly if d_F is short.
         """
         formation = self._formation
         min_s = math.sqrt(PEAK_ACCEL * formation.gap_m / GENTLE_MPS2)

@@ -126,7 +126,7 @@ def test_moves_by_a_column_are_gentle_where_the_slot_permits(
 
 
 def test_forward_moves_close_up_early() -> None:
-    """They brake for longer than they accelerate, so most fuel is burnt by the shorter part."""
+    """They brake for longer than they accelerate; braking burns no fuel."""
     ahead, back = (profile_of(dx, 0, 6.0).states for dx in (1, -1))
     half = len(ahead) // 2
     assert ahead[half, 0] > 0.505 * SCENARIO.formation.gap_m
@@ -144,7 +144,7 @@ def test_moves_in_the_papers_slots_are_those_of_minimum_jerk(dx: int) -> None:
 
 
 def test_moves_keep_what_the_limits_allow() -> None:
-    """3.2 s where the longer time to collision of forward moves is impossible, or minimum jerk."""
+    """Where the first bound is infeasible, the second applies; without a feasible one, neither."""
     stiff = parse_scenario(
         {
             "formation": {"gap_m": 20.0, "speed_mps": 20.0, "cycle_s": 5.0},
@@ -162,10 +162,9 @@ def min_ttc_s(scenario: Scenario, dx: int) -> float:
     return float((gaps_m[1:-1] / np.abs(v[1:-1])).min())
 
 
-def test_profiles_are_found_far_below_the_iteration_limit(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Solvers of other builds may need more iterations."""
+@pytest.fixture
+def solved(monkeypatch: pytest.MonkeyPatch) -> list[QPResult]:
+    """Return a list to which all results of quadratic programs are added; caches are empty."""
     found: list[QPResult] = []
     solve = QuadraticProgram.solve
 
@@ -176,11 +175,27 @@ def test_profiles_are_found_far_below_the_iteration_limit(
     monkeypatch.setattr(QuadraticProgram, "solve", counted)
     for cached in (move_profile, plan_trajectory):
         cached.cache_clear()
+    return found
+
+
+def test_profiles_are_found_far_below_the_iteration_limit(solved: list[QPResult]) -> None:
+    """Other builds of OSQP may need more iterations."""
     for slot_s in (4.6, 5.4, 6.0):
         for dx, dy in displacements(2)[1:]:
             profile_of(dx, dy, slot_s)
-    assert all(one.status == SOLVED for one in found)
-    assert max(one.iterations for one in found) < 20_000
+    assert all(one.status == SOLVED for one in solved)
+    assert max(one.iterations for one in solved) < 20_000
+
+
+def test_scenarios_with_equal_moves_share_profiles_and_infeasible_bounds(
+    solved: list[QPResult],
+) -> None:
+    tables = {"formation": {"operation": "rolling", "cycle_s": 4.0}}
+    check_moves(parse_scenario(tables))
+    assert any(not one.usable for one in solved)
+    count = len(solved)
+    check_moves(parse_scenario({"seed": 2, **tables}))
+    assert len(solved) == count
 
 
 @pytest.mark.parametrize(
