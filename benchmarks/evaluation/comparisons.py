@@ -17,8 +17,8 @@ OWN: Final = ("formations", "rolling")
 OPPONENTS: Final = tuple(label for label in LABELS if label not in FORMATIONS)
 TUNED: Final = ("lc2013-tuned", "sl2015-tuned")
 """Drivers with the best sets that `laneweave tune` has found for this road."""
-FROM_VOLUME: Final = 1000.0
-"""Lowest volume in vehicles/(lane h) of the comparison with them."""
+TUNED_FROM_VEH_PER_LANE_H: Final = 1000.0
+"""Minimum volume of the comparison with tuned drivers."""
 WORDS: Final = {
     Verdict.LESS: "faster than",
     Verdict.MORE: "**slower than**",
@@ -26,7 +26,9 @@ WORDS: Final = {
     Verdict.UNKNOWN: "not compared with",
 }
 """What a difference of travel times means, in the order of the sentences."""
-_MEANING: Final = {
+COMPARED: Final = (("travel_s", "travel time", "s"), ("co2_g_per_km", "CO2", "g/km"))
+"""Figures that are compared with tuned drivers: their fields, names and units."""
+_COMPARED_WORDS: Final = {
     Verdict.LESS: "less",
     Verdict.MORE: "**more**",
     Verdict.NONE: "not different",
@@ -55,7 +57,7 @@ def _of_one(evidence: Evidence, label: str) -> str:
 
 def tuned_comparison(evidence: Evidence) -> str:
     """Return the figures of both operations beside tuned drivers, and a sentence for each pair."""
-    volumes = [volume for volume in VOLUMES if volume >= FROM_VOLUME]
+    volumes = [volume for volume in VOLUMES if volume >= TUNED_FROM_VEH_PER_LANE_H]
     rows = [
         _figures(evidence.by_key[label, volume])
         for volume in volumes
@@ -69,10 +71,20 @@ def tuned_comparison(evidence: Evidence) -> str:
     )  # fmt: skip
     sentences, without = [], dict[str, None]()
     for volume, own, other in itertools.product(volumes, OWN, TUNED):
-        words = _against(evidence, own, other, volume)
+        found = {
+            (name, unit): one
+            for figure, name, unit in COMPARED
+            if (one := _difference(evidence, own, other, volume, figure)) is not None
+        }
+        words = [
+            f"{name} {_COMPARED_WORDS[one.verdict]} ({one.mean:+.2f} {unit}, "
+            f"{one.bounds.low:+.2f} to {one.bounds.high:+.2f})"
+            for (name, unit), one in found.items()
+            if one.bounds is not None
+        ]
         if words:
-            sentences.append(f"- At {volume:g}, `{own}` against `{other}`: {words}.")
-        elif words is not None:
+            sentences.append(f"- At {volume:g}, `{own}` against `{other}`: {', '.join(words)}.")
+        elif found:
             without[f"{volume:g}"] = None
     if without:
         sentences.append(
@@ -93,28 +105,6 @@ def _figures(row: PointRow) -> list[str]:
         number(row.mean("hard_brakes"), 1),
         number(row.mean("co2_g_per_km"), 1),
     ]
-
-
-def _against(evidence: Evidence, own: str, other: str, volume: float) -> str | None:
-    """Return the differences of travel time and CO2 in words; empty: there are no intervals.
-
-    None: a method has no run there, or one of the figures is unknown.
-    """
-    words = []
-    for figure, name, unit in (
-        ("travel_s", "travel time", "s"),
-        ("co2_g_per_km", "CO2", "g/km"),
-    ):
-        found = _difference(evidence, own, other, volume, figure)
-        if found is None:
-            return None
-        if found.bounds is not None:
-            low, high = found.bounds
-            words.append(
-                f"{name} {_MEANING[found.verdict]} ({found.mean:+.2f} {unit}, "
-                f"{low:+.2f} to {high:+.2f})"
-            )
-    return ", ".join(words)
 
 
 def _difference(
