@@ -33,9 +33,9 @@ _CYCLES_S: Final = (5.0, 7.0)
 _MEMBERS: Final = 2
 """Change of the maximum number of vehicles in a formation."""
 _DELAY_S: Final = 0.5
-"""Additional delay by the cellular network."""
+"""Additional delay of messages by the cellular network."""
 _LOSS: Final = 0.3
-"""Additional loss by the cellular network, and additional share of time in bursts."""
+"""Added to the loss in the cellular network and to the share of time in bursts."""
 _MAX_LOSS: Final = 0.9
 """Maximum of both."""
 
@@ -57,7 +57,7 @@ class Factor:
 
     name: str
     low: Level | None
-    """None: the base itself is the low end, or the low end is impossible."""
+    """None: the setting of the base is the low end, or the scenario does not allow the low end."""
     high: Level | None
     refused: tuple[str, ...] = ()
     """Why ends are impossible in this scenario."""

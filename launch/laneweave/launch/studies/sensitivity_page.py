@@ -97,10 +97,10 @@ def write_sensitivity(
     draw_tornado(factors, results, chart)
     refused = [reason for factor in factors for reason in factor.refused]
     caption = (
-        "Mean delay with one setting changed at a time; lines: from the smallest to the largest "
-        "of a seed. Delay: mean travel time beyond that at "
-        "v_F, the speed of the lattice; T_F: time of a step; S3: the part of the road in which "
-        "vehicles change lanes; N: maximum number of vehicles of a formation."
+        "Mean delay with one setting changed at a time; lines: range over the seeds. Delay: mean "
+        "travel time beyond that at v_F, the speed of the lattice; T_F: time of a step; S3: the "
+        "part of the road in which vehicles change lanes; N: maximum number of vehicles of a "
+        "formation."
     )
     section = Section(
         "Sensitivity",

@@ -78,8 +78,8 @@ class Report(Message, frozen=True):
     solve_ms: bytes = b""
     """CPU time of each solve [ms], little-endian float32."""
     sidelink: Int64 = 0
-    """Number of messages that other vehicles sent to this one, including lost ones; only with a
-    radio."""
+    """Number of messages from other vehicles to this one by radio, including lost ones; 0 without
+    a radio."""
     sidelink_lost: Int64 = 0
     """Number of those that were lost."""
     cellular: Int64 = 0
