@@ -138,7 +138,7 @@ VARIANTS = {
             ramp_veh_h=800.0,
             leaving_veh_h=800.0,
         )
-        for cycle_s in (6.0, 4.0)
+        for cycle_s in (6.0, 5.0)
     },
 }
 

@@ -25,6 +25,10 @@ from laneweave.protocol.vehicle.lane_ends import early_start_m, sections_to_line
 
 REWARD = -0.5
 """Extra cost of a move that gains a column if drift is rewarded; a move costs 0.3."""
+_MAX_ANNEALS, _MAX_WORK = 6, 600.0
+"""How often paths are annealed per slot at most (decision 76). On longer roads the second limit
+applies: annealings times the square of the slots of the part where vehicles move, with which the
+time of a path search grows."""
 
 
 Planner = Callable[
@@ -84,12 +88,16 @@ def stream_road(scenario: Scenario) -> StreamRoad:
     around_m = first_moves_m(
         road.s1_m, road.s2_m, formation.speed_mps, formation.settle_s, in_s2=True
     )
+    advance_m = formation.speed_mps * scenario.timing.cycles_s[0]
+    moves_from_m = scenario.geometry.moves_from_m
+    slots = (road.length_m - moves_from_m) / advance_m
     return StreamRoad(
         around_m=around_m,
         lanes=road.lanes,
         pitch_m=formation.gap_m,
-        advance_m=formation.speed_mps * scenario.timing.cycles_s[0],
-        sorting_m=(scenario.geometry.moves_from_m, road.length_m),
+        advance_m=advance_m,
+        sorting_m=(moves_from_m, road.length_m),
+        anneals=max(1, min(_MAX_ANNEALS, int(_MAX_WORK / max(1.0, slots) ** 2))),
         length_m=road.length_m,
         body_m=scenario.types.longest_body_m,
         mode=mode,

@@ -16,7 +16,7 @@ SHORTEST_CYCLE_S, LONGEST_CYCLE_S = 4.0, 7.0
 """Range of T_F if `formation.cycle_s` is not set; the lower end is the paper's value."""
 GENTLE_MPS2 = 3.0
 """Maximum acceleration of minimum-jerk moves within the comfortable T_F."""
-ROLLING_CYCLES_S = ((2000.0, 6.0), (2200.0, 5.4), (math.inf, 4.6))
+ROLLING_CYCLES_S = ((2000.0, 6.0), (2200.0, 5.4), (math.inf, 5.0))
 """Volumes [vehicles/(lane h)] in ascending order, and T_F [s] of the rolling operation up to each;
 denser traffic needs more steps on the same road (decision 76)."""
 MIN_MERGING_SLOTS = 4

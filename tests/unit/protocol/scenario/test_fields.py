@@ -115,7 +115,7 @@ def test_slots_are_from_four_to_seven_seconds_unless_they_are_given() -> None:
     assert slower.timing.move_durations == {40}
     rolling = parse_scenario({"formation": {"operation": "rolling"}})
     assert (rolling.timing.slots_s, rolling.timing.horizon_ticks) == ((6.0,), 60)
-    for volume, slot_s in ((2000.0, 6.0), (2000.1, 5.4), (2200.0, 5.4), (2200.1, 4.6)):
+    for volume, slot_s in ((2000.0, 6.0), (2000.1, 5.4), (2200.0, 5.4), (2200.1, 5.0)):
         dense = parse_scenario(
             {"formation": {"operation": "rolling"}, "demand": {"volume_veh_per_lane_h": volume}}
         )

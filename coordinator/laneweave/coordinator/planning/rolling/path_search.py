@@ -95,6 +95,7 @@ class StreamPlanner:
                 arrays.costs,
                 road.rounds,
                 road.max_paths,
+                road.anneals,
                 rng,
                 arrays.scratch,
             )

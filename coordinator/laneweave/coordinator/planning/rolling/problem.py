@@ -73,9 +73,11 @@ class StreamRoad:
         default=ConflictModel(("node", "edge", "special-1", "closing")), validator=_one_per_cell
     )
     rounds: int = 2000
-    """Maximum number of rounds of improvement per slot."""
+    """Maximum number of rounds of improvement per annealing."""
     max_paths: int = 50_000
-    """Maximum number of path searches (about 5 us each) per slot."""
+    """Maximum number of path searches (about 5 us each on the paper's road) per annealing."""
+    anneals: int = 1
+    """Maximum number of times that paths are annealed per slot."""
     sections: tuple[LaneSection, ...] = Factory(
         lambda road: open_sections(road.lanes, road.length_m), takes_self=True
     )
@@ -273,10 +275,10 @@ class StreamCosts:
     off_lane: float = 0.1
     """Cost of each slot at whose beginning the vehicle is outside its target sections."""
     backward: float = 2.0
-    """Extra cost of a move that loses a column."""
-    forward: float = 1.0
-    """Extra cost of a move that gains a column, which needs more energy than one that loses a
-    column, but costs no time; a negative cost rewards gaining columns."""
+    """Extra cost of a move that loses a column, and a second."""
+    forward: float = 2.0
+    """Extra cost of a move that gains a column, which costs no time, but more energy than one that
+    loses a column (decision 76); a negative cost rewards gaining columns."""
     missing: float = 60.0
     """Cost of ending elsewhere than at a target; up to twice as much near the end."""
     closing: float = 10.0

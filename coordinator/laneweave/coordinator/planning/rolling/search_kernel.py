@@ -276,7 +276,7 @@ def _change_staying(table, paths):
 
 
 @njit(cache=True, nogil=True)
-def improve(table, paths, costs, rounds, max_paths, rng, scratch):
+def _anneal(table, paths, costs, rounds, max_paths, rng, scratch):
     """Improve all paths for some rounds; return the number of rounds.
 
     While vehicles miss their lanes, ejection chains and reorderings alternate; the permitted cost
@@ -315,3 +315,18 @@ def improve(table, paths, costs, rounds, max_paths, rng, scratch):
             _reorder(table, paths, costs, v, size, slack, rng, scratch)
         turn += 1
     return turn
+
+
+@njit(cache=True, nogil=True)
+def improve(table, paths, costs, rounds, max_paths, anneals, rng, scratch):
+    """Improve all paths; return the number of rounds.
+
+    The annealing is repeated while vehicles miss lanes that they could reach, `anneals` times at
+    most, each with `rounds` rounds and `max_paths` path searches at most.
+    """
+    turns = 0
+    for _ in range(anneals):
+        turns += _anneal(table, paths, costs, rounds, max_paths, rng, scratch)
+        if _list_costly(paths, scratch.off_lane, scratch.costly)[0] == 0:
+            break
+    return turns

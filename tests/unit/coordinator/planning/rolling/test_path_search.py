@@ -25,8 +25,10 @@ from laneweave.coordinator.planning.rolling.problem import (
     StreamVehicle,
 )
 from laneweave.coordinator.planning.rolling.rolling_validator import problems_of_plan
+from laneweave.coordinator.rolling.checked_planner import stream_road
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.road_layout import LaneSection
+from laneweave.protocol.scenario.fields import Scenario
 from support import rolling_oracles as oracle
 from support.examples import examples
 from support.rolling_oracles import ROAD, SHORT, Stream, streams
@@ -511,3 +513,30 @@ def test_the_limit_on_path_searches_is_kept() -> None:
     quick = attrs.evolve(ROAD, rounds=3)
     assert StreamPlanner(quick).plan(0, vehicles).rounds == 3
     assert StreamPlanner(attrs.evolve(ROAD, max_paths=1)).plan(0, vehicles).rounds <= 2
+    quick = attrs.evolve(ROAD, rounds=3, anneals=4)
+    assert StreamPlanner(quick).plan(0, vehicles).rounds == 12
+
+
+def test_the_search_goes_on_while_vehicles_miss_their_lanes() -> None:
+    missed = {1: 0, 6: 0}
+    finished = 0
+    for seed in range(40):
+        vehicles = dense(Random(seed), range(20, 40), 0.7)
+        once, longer = (
+            StreamPlanner(attrs.evolve(ROAD, rounds=100, anneals=anneals)).plan(0, vehicles)
+            for anneals in missed
+        )
+        assert is_legal(ROAD, longer, vehicles)
+        missed[1] += len(once.missed)
+        missed[6] += len(longer.missed)
+        if not once.missed:
+            finished += 1
+            assert longer.paths == once.paths
+    assert finished > 5
+    assert 2 * missed[6] < missed[1]
+
+
+@pytest.mark.parametrize(("s3_m", "anneals"), [(1e-3, 6), (600.0, 6), (900.0, 2), (9600.0, 1)])
+def test_paths_are_annealed_less_often_on_longer_roads(s3_m: float, anneals: int) -> None:
+    road = evolve(Scenario().road, s3_m=s3_m)
+    assert stream_road(evolve(Scenario(), road=road)).anneals == anneals
