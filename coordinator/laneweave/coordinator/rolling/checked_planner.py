@@ -25,10 +25,12 @@ from laneweave.protocol.vehicle.lane_ends import early_start_m, sections_to_line
 
 REWARD = -0.5
 """Extra cost of a move that gains a column if drift is rewarded; a move costs 0.3."""
-_MAX_ANNEALS, _MAX_WORK = 6, 600.0
-"""How often paths are annealed per slot at most (decision 76). On longer roads the second limit
-applies: annealings times the square of the slots of the part where vehicles move, with which the
-time of a path search grows."""
+_MAX_ANNEALS = 6
+"""Maximum number of annealings per slot (decision 76)."""
+_MAX_WORK = 600.0
+"""Maximum product of this number and n squared, where vehicles may move during n slots.
+
+The time of a path search grows with n squared, so longer roads get fewer annealings."""
 
 
 Planner = Callable[

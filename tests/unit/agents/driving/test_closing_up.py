@@ -27,8 +27,8 @@ from laneweave.sim_bridge.bodies.plant import Plant
 SCENARIO = Scenario()
 LIMITS, LATTICE, TICK_S = SCENARIO.vehicle, SCENARIO.lattice, SCENARIO.runtime.tick_s
 V_F = LATTICE.speed_mps
-SLOTS_S = (4.0, 4.6, 5.4, 6.0, 7.0)
-"""The paper's T_F, those of the rolling operation, and the longest one of formations."""
+SLOTS_S = (4.0, 4.6, 5.0, 5.4, 6.0, 7.0)
+"""The paper's T_F, the shortest with gentle moves, those of the rolling operation, the longest."""
 MOVES = [(dx, dy) for dx in (-1, 0, 1) for dy in (-1, 0, 1)]
 BRAKE = EmergencyBrake(LIMITS, SCENARIO.braking, TICK_S)
 ERROR_M = spare_error_m(LIMITS, SCENARIO.braking, SCENARIO.sensing, 1.5 * V_F, V_F)
@@ -180,7 +180,7 @@ def solved(monkeypatch: pytest.MonkeyPatch) -> list[QPResult]:
 
 def test_profiles_are_found_far_below_the_iteration_limit(solved: list[QPResult]) -> None:
     """Other builds of OSQP may need more iterations."""
-    for slot_s in (4.6, 5.4, 6.0):
+    for slot_s in (4.6, 5.0, 5.4, 6.0):
         for dx, dy in displacements(2)[1:]:
             profile_of(dx, dy, slot_s)
     assert all(one.status == SOLVED for one in solved)

@@ -77,7 +77,7 @@ class StreamRoad:
     max_paths: int = 50_000
     """Maximum number of path searches (about 5 us each on the paper's road) per annealing."""
     anneals: int = 1
-    """Maximum number of times that paths are annealed per slot."""
+    """Maximum number of annealings per slot."""
     sections: tuple[LaneSection, ...] = Factory(
         lambda road: open_sections(road.lanes, road.length_m), takes_self=True
     )
@@ -275,10 +275,10 @@ class StreamCosts:
     off_lane: float = 0.1
     """Cost of each slot at whose beginning the vehicle is outside its target sections."""
     backward: float = 2.0
-    """Extra cost of a move that loses a column, and a second."""
+    """Extra cost of a move that loses a column: the vehicle arrives later."""
     forward: float = 2.0
-    """Extra cost of a move that gains a column, which costs no time, but more energy than one that
-    loses a column (decision 76); a negative cost rewards gaining columns."""
+    """Extra cost of a move that gains a column: the vehicle arrives earlier, but needs more energy
+    than for a move that loses one (decision 76). A negative cost rewards gaining columns."""
     missing: float = 60.0
     """Cost of ending elsewhere than at a target; up to twice as much near the end."""
     closing: float = 10.0

@@ -319,10 +319,10 @@ def _anneal(table, paths, costs, rounds, max_paths, rng, scratch):
 
 @njit(cache=True, nogil=True)
 def improve(table, paths, costs, rounds, max_paths, anneals, rng, scratch):
-    """Improve all paths; return the number of rounds.
+    """Improve all paths by up to `anneals` annealings; return the number of rounds.
 
-    The annealing is repeated while vehicles miss lanes that they could reach, `anneals` times at
-    most, each with `rounds` rounds and `max_paths` path searches at most.
+    Another annealing follows only while vehicles miss lanes that they could reach. `rounds` and
+    `max_paths` limit the rounds and path searches of each.
     """
     turns = 0
     for _ in range(anneals):
