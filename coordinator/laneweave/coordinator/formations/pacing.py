@@ -7,9 +7,9 @@ Before the rear of the formation is in the stage, vehicles may already move alon
 those in it may change lanes; when its front leaves the stage, those behind may still move.
 
 Plans stay in the blocks of their formations, so their footprints never intersect. But two moves
-towards each other across the border between formations (conflict kind `closing`) would trigger the
-emergency brake. Formations are planned one after another, and the later plan pauses for a slot to
-avoid such moves.
+towards each other across the border between formations (conflict kind `closing`) would bring the
+vehicles within 2.5 s of a collision, and may trigger the emergency brake. Formations are planned
+one after another, and the later plan pauses for a slot, or has shorter slots, to avoid such moves.
 """
 
 from __future__ import annotations
@@ -56,7 +56,9 @@ def paced(
 ) -> Plan:
     """Return a plan with the longest slots with which it ends in time, otherwise the shortest.
 
-    The plan pauses where its moves would have `closing` conflicts with those of its neighbours.
+    The plan pauses where its moves would have `closing` conflicts with those of its neighbours. If
+    there is no time for pauses, its slots are shorter. Only if even the shortest slots leave
+    conflicts does it get the longest ones with which it ends in time in spite of them.
 
     Args:
         plan: plan with the latest start: when all of its vehicles are in the stage, and those from
@@ -69,7 +71,7 @@ def paced(
     """
     slots_s, slack_s = scenario.timing.slots_s[::-1], scenario.formation.slack_s
     comfortable = [slot_s for slot_s in slots_s if slot_s >= scenario.timing.comfortable_cycle_s]
-    best = plan
+    closing: Plan | None = None
 
     def in_time(one: Plan, reserve_s: float = 0.0) -> bool:
         return all(
@@ -86,10 +88,12 @@ def paced(
         t0_s = plan.t0_s
         if len(slots_s) > 1:
             t0_s = _start_s(plan, slot_s, not_before_s, scenario, from_m)
-        best = with_pauses(replace(plan, t0_s=t0_s, slot_s=slot_s), others, slack_s, in_time)
-        if in_time(best, reserve_s):
-            return best
-    return best
+        last = with_pauses(replace(plan, t0_s=t0_s, slot_s=slot_s), others, slack_s, in_time)
+        if in_time(last, reserve_s):
+            if not closing_steps(last, others, slack_s):
+                return last
+            closing = closing or last
+    return closing or last
 
 
 def _start_s(
@@ -106,7 +110,7 @@ def _start_s(
 
 
 def with_pauses(
-    plan: Plan, others: Iterable[Plan], slack_s: float, in_time: Callable[[Plan], bool]
+    plan: Plan, others: Sequence[Plan], slack_s: float, in_time: Callable[[Plan], bool]
 ) -> Plan:
     """Return a plan with pauses, so that no move has a `closing` conflict with another plan.
 
@@ -118,6 +122,22 @@ def with_pauses(
         slack_s: difference between the length of a slot and the duration of a move [s].
         in_time: returns whether a plan ends in time. Conflicts that remain are left to the
             emergency brake, because a late vehicle is better than one in a wrong lane.
+    """
+    while closing := closing_steps(plan, others, slack_s):
+        paused = _paused(plan, min(closing))
+        if not in_time(paused):
+            break
+        plan = paused
+    return plan
+
+
+def closing_steps(plan: Plan, others: Iterable[Plan], slack_s: float) -> set[int]:
+    """Return the steps in which moves of a plan have `closing` conflicts with other plans.
+
+    Args:
+        plan: the plan.
+        others: plans of neighbouring formations.
+        slack_s: as in `with_pauses`.
     """
     theirs = [
         (other.t0_s + step * other.slot_s, other.slot_s - slack_s, (origin, target))
@@ -135,19 +155,12 @@ def with_pauses(
             for other_s, other_lasts_s, other in theirs
         )
 
-    while True:
-        closing = [
-            step
-            for moves in plan.moves.values()
-            for step, origin, target in moves
-            if closes_up(step, (origin, target))
-        ]
-        if not closing:
-            return plan
-        paused = _paused(plan, min(closing))
-        if not in_time(paused):
-            return plan
-        plan = paused
+    return {
+        step
+        for moves in plan.moves.values()
+        for step, origin, target in moves
+        if closes_up(step, (origin, target))
+    }
 
 
 def _paused(plan: Plan, pause: int) -> Plan:

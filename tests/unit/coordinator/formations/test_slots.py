@@ -8,7 +8,13 @@ import pytest
 from msgspec.structs import replace
 
 from laneweave.coordinator.formations import pacing
-from laneweave.coordinator.formations.pacing import MIN_RESERVE_S, RESERVE_S, steps_of, with_pauses
+from laneweave.coordinator.formations.pacing import (
+    MIN_RESERVE_S,
+    RESERVE_S,
+    closing_steps,
+    steps_of,
+    with_pauses,
+)
 from laneweave.coordinator.formations.roster import exit_time_s, start_time_s
 from laneweave.protocol.lattice import Cell, PlannedMove
 from laneweave.protocol.scenario.fields import Scenario
@@ -130,3 +136,27 @@ def test_neighbours_with_slots_of_other_lengths_are_kept_apart(
     late = replace(mine, t0_s=mine.t0_s + late_s)
     paused = with_pauses(late, [theirs], SCENARIO.formation.slack_s, lambda _: True)
     assert (steps_of(paused) - 1 > 0) is bool(pauses)
+
+
+CLOSING = replace(climbing(0), moves={A: ((0, (-5, 1), (-4, 1)), (1, (-4, 1), (-4, 2)))})
+"""A vehicle moves forwards, and then to another lane."""
+
+
+@pytest.mark.parametrize(
+    ("room_s", "slot_s", "steps"),
+    [
+        (3 * 7.0 + RESERVE_S, 7.0, 3),
+        (3 * 6.6 + RESERVE_S, 6.6, 3),
+        (3 * 4.4 + MIN_RESERVE_S, 4.4, 3),
+        (3 * 4.0 + MIN_RESERVE_S - 0.1, 5.8, 2),  # no pause: the longest slots
+    ],
+)
+def test_slots_are_shorter_if_there_is_no_time_for_a_pause_otherwise(
+    room_s: float, slot_s: float, steps: int
+) -> None:
+    theirs = replace(CLOSING, moves={B: ((0, (-2, 1), (-3, 1)),)}, slot_s=4.0)
+    end_s = CLOSING.t0_s + room_s
+    chosen = pacing.paced(CLOSING, [theirs], CLOSING.t0_s, lambda _: end_s, SCENARIO)
+    assert (chosen.slot_s, steps_of(chosen)) == (pytest.approx(slot_s), steps)
+    closing = closing_steps(chosen, [theirs], SCENARIO.formation.slack_s)
+    assert closing == (set() if steps > 2 else {0})
