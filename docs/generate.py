@@ -26,6 +26,8 @@ if __name__ == "__main__":  # same paths as `pythonpath` in pyproject.toml
     sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 
+from attrs import fields_dict
+
 import laneweave
 import radio
 import roads
@@ -51,6 +53,8 @@ from laneweave.launch.fault_search.profiles import PROFILES
 from laneweave.launch.observe.findings import RULES, FindingsMetrics
 from laneweave.launch.observe.metrics_server import PROCESS, PROCESS_MEANING
 from laneweave.launch.recordings.results_over_seeds import RESULTS
+from laneweave.launch.studies.sensitivity import Result
+from laneweave.launch.studies.sensitivity_page import HEADINGS, result_row
 from laneweave.protocol.radio.radio_core import RadioMetrics
 from laneweave.protocol.runtime.metrics import (
     MetricsSnapshot,
@@ -835,19 +839,14 @@ def _surprises() -> str:
 def _sensitivity() -> str:
     """Return the table of a study of single settings, by `laneweave sensitivity`."""
     study = json.loads(SENSITIVITY.read_text(encoding="utf-8"))
-    headings = (
-        "setting", "value", "mean delay", "in their lane", "smallest TTC",
-        "smallest gap", "CO2, petrol", "overlaps",
-    )  # fmt: skip
     levels = [("base", study["base"] | {"text": ""})]
     levels += [(one["name"], level) for one in study["factors"] for level in one["levels"]]
-    lines = [f"| {' | '.join(headings)} |", "|---" * len(headings) + "|"]
-    lines += [
-        f"| {name} | {level['text']} | {level['delay_s']:z.2f} s "
-        f"| {level['arrived_percent']:.2f} % | {level['min_ttc_s']:.2f} s "
-        f"| {level['min_gap_m']:.1f} m | {level['co2_g_per_km']:.1f} g/km | {level['overlaps']} |"
-        for name, level in levels
+    rows = [
+        result_row(name, one["text"], Result(**{key: one[key] for key in fields_dict(Result)}))
+        for name, one in levels
     ]
+    lines = [f"| {' | '.join(row)} |" for row in (HEADINGS, *rows)]
+    lines.insert(1, "|---" * len(HEADINGS) + "|")
     refused = [f"- {reason}" for one in study["factors"] for reason in one["refused"]]
     if refused:
         lines += ["", "Impossible on this road:", "", *refused]

@@ -17,8 +17,8 @@ OWN: Final = ("formations", "rolling")
 OPPONENTS: Final = tuple(label for label in LABELS if label not in FORMATIONS)
 TUNED: Final = ("lc2013-tuned", "sl2015-tuned")
 """Drivers with the best sets that `laneweave tune` has found for this road."""
-TUNED_FROM_VEH_PER_LANE_H: Final = 1000.0
-"""Minimum volume of the comparison with tuned drivers."""
+TUNED_VOLUMES: Final = tuple(volume for volume in VOLUMES if volume >= 1000.0)
+"""Volumes of the comparison with tuned drivers, in vehicles/(lane h)."""
 WORDS: Final = {
     Verdict.LESS: "faster than",
     Verdict.MORE: "**slower than**",
@@ -45,7 +45,7 @@ def _of_one(evidence: Evidence, label: str) -> str:
     sentences = []
     for volume in (volume for volume in VOLUMES if planned(label, volume)):
         found = {
-            other: _difference(evidence, label, other, volume, "travel_s") for other in OPPONENTS
+            other: difference_of(evidence, label, other, volume, "travel_s") for other in OPPONENTS
         }
         rows.append([f"{volume:g}", *(_cell(found[other], other, volume) for other in OPPONENTS)])
         words = "; ".join(_words(found))
@@ -57,10 +57,9 @@ def _of_one(evidence: Evidence, label: str) -> str:
 
 def tuned_comparison(evidence: Evidence) -> str:
     """Return the figures of both operations beside tuned drivers, and a sentence for each pair."""
-    volumes = [volume for volume in VOLUMES if volume >= TUNED_FROM_VEH_PER_LANE_H]
     rows = [
         _figures(evidence.by_key[label, volume])
-        for volume in volumes
+        for volume in TUNED_VOLUMES
         for label in (*OWN, *TUNED)
         if (label, volume) in evidence.by_key
     ]
@@ -70,11 +69,11 @@ def tuned_comparison(evidence: Evidence) -> str:
         "CO2, petrol [g/km]",
     )  # fmt: skip
     sentences, without = [], dict[str, None]()
-    for volume, own, other in itertools.product(volumes, OWN, TUNED):
+    for volume, own, other in itertools.product(TUNED_VOLUMES, OWN, TUNED):
         found = {
             (name, unit): one
             for figure, name, unit in COMPARED
-            if (one := _difference(evidence, own, other, volume, figure)) is not None
+            if (one := difference_of(evidence, own, other, volume, figure)) is not None
         }
         words = [
             f"{name} {_COMPARED_WORDS[one.verdict]} ({one.mean:+.2f} {unit}, "
@@ -107,10 +106,20 @@ def _figures(row: PointRow) -> list[str]:
     ]
 
 
-def _difference(
+def difference_of(
     evidence: Evidence, own: str, other: str, volume: float, figure: str
 ) -> Difference | None:
-    """Return the difference of the means of a figure; None: a method has no run there."""
+    """Return the difference of a figure between two methods at a volume, paired by seed.
+
+    None: a method has no complete run there, or they have no seed in common.
+
+    Args:
+        evidence: the runs.
+        own: label of one method.
+        other: label of the method whose figures are subtracted.
+        volume: in vehicles/(lane h).
+        figure: name of a field of the runs.
+    """
     found = [_by_seed(evidence, label, volume, figure) for label in (own, other)]
     return difference(*found)
 

@@ -83,11 +83,11 @@ class Evidence:
         kept = self
         if new.runs:
             labels = {row.label for row in new.runs}
-            seeds = {(*row.key, row.seed) for row in new.runs}
+            replaced = {(*row.key, row.seed) for row in new.runs}
             others = [
                 row
                 for row in self.runs
-                if row.label not in labels or (add_runs and (*row.key, row.seed) not in seeds)
+                if row.label not in labels or (add_runs and (*row.key, row.seed) not in replaced)
             ]
             if others and new.setting != self.setting:
                 names = ", ".join(sorted({row.label for row in others}))

@@ -2,17 +2,39 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Sequence
+from typing import Final
 
+from evaluation.comparisons import OWN, TUNED, TUNED_VOLUMES, difference_of
 from evaluation.evidence import Evidence
 from evaluation.markdown import HOLDS, MISSED, MISSING, markdown, number
 from evaluation.points import PointRow
-from evaluation.programme import FORMATIONS, GOALS, MAX_COST_RATIO, MIN_FACTORS, SEEDS, Goal
+from evaluation.programme import (
+    FORMATIONS,
+    GOALS,
+    MAX_COST_RATIO,
+    MIN_FACTORS,
+    SEEDS,
+    Goal,
+    planned,
+)
+
+AGAINST_TUNED: Final = (
+    ("travel_s", "travel time", "at most 0.5 % longer", 0.5),
+    ("co2_g_per_km", "CO2", "not above", 0.0),
+)
+"""Goals against tuned drivers: field, name, text and maximum difference [%]."""
 
 
 def goals_table(evidence: Evidence) -> str:
     """Return the table of all goals."""
-    rows = [*_traffic(evidence), *_safety(evidence), *_runtime(evidence)]
+    rows = [
+        *_traffic(evidence),
+        *(row for label in OWN for row in _against_tuned(evidence, label)),
+        *_safety(evidence),
+        *_runtime(evidence),
+    ]
     return markdown(["goal", "required", "measured", ""], rows)
 
 
@@ -69,6 +91,39 @@ def _measured(row: PointRow, goal: Goal) -> str:
         parts.append(f"{row.total('fallbacks')} of {row.total('plans'):,} plans")
     few = "" if len(row.seeds) >= len(SEEDS) else f" ({len(row.seeds)} of {len(SEEDS)} seeds)"
     return ", ".join(parts) + few
+
+
+def _against_tuned(evidence: Evidence, label: str) -> Iterator[tuple[str, ...]]:
+    """Yield the goals for an operation at the volumes of the comparison with tuned drivers."""
+    name = f"`{label}`, from {TUNED_VOLUMES[0]:g} veh/(lane h): "
+    at = [(label, volume) for volume in TUNED_VOLUMES if planned(label, volume)]
+    rows = [evidence.by_key[key] for key in at if key in evidence.by_key]
+    below_s = [one for row in rows for one in row.values("ttc_below_3_s")]
+    exposed = sum(one > 0.0 for one in below_s)
+    yield _row(
+        f"{name}below 3 s to collision", "never", f"in {exposed} of {len(below_s)} runs",
+        [one == 0.0 for one in below_s],
+    )  # fmt: skip
+    hard = [one for row in rows for one in row.values("hard_brakes")]
+    yield _row(
+        f"{name}braking harder than 5 m/s2", "never", f"{sum(hard):g} vehicles in {len(hard)} runs",
+        [one == 0.0 for one in hard],
+    )  # fmt: skip
+    for figure, what, required, max_percent in AGAINST_TUNED:
+        percent = list(_differences_percent(evidence, label, figure))
+        low, high = min(percent, default=0.0), max(percent, default=0.0)
+        yield _row(
+            f"{name}{what} against tuned drivers", required, f"{low:+.1f} to {high:+.1f} %",
+            [one <= max_percent for one in percent],
+        )  # fmt: skip
+
+
+def _differences_percent(evidence: Evidence, label: str, figure: str) -> Iterator[float]:
+    """Yield the differences of means to each of the tuned drivers at each volume [%]."""
+    for volume, other in itertools.product(TUNED_VOLUMES, TUNED):
+        found = difference_of(evidence, label, other, volume, figure)
+        if found is not None and (mean := evidence.by_key[other, volume].mean(figure)):
+            yield 100.0 * found.mean / mean
 
 
 def _safety(evidence: Evidence) -> Iterator[tuple[str, ...]]:

@@ -64,13 +64,14 @@ def draw_tornado(factors: Sequence[Factor], results: Mapping[str, Result], out: 
 
 def results_table(factors: Sequence[Factor], results: Mapping[str, Result]) -> Table:
     """Return the results of the base and of all levels."""
-    rows = [_row(BASE, "", results[BASE])]
+    rows = [result_row(BASE, "", results[BASE])]
     for factor in factors:
-        rows += [_row(factor.name, one.text, results[one.label]) for one in factor.levels]
+        rows += [result_row(factor.name, one.text, results[one.label]) for one in factor.levels]
     return Table(HEADINGS, rows, "Means and extremes over the seeds", text_columns=2)
 
 
-def _row(name: str, text: str, result: Result) -> tuple[str, ...]:
+def result_row(name: str, text: str, result: Result) -> tuple[str, ...]:
+    """Return the cells below `HEADINGS` for the base or for a level of a factor."""
     return (
         name,
         text,

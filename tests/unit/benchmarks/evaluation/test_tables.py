@@ -17,7 +17,7 @@ from evaluation.comparisons import comparison, tuned_comparison
 from evaluation.evidence import Evidence, Picture, read_evidence, write_evidence
 from evaluation.goals import goals_table, meets
 from evaluation.intervals import interval
-from evaluation.points import PlanningTimes, points_of_runs
+from evaluation.points import PlanningTimes, PointRow, points_of_runs
 from evaluation.programme import FORMATIONS, GOALS, LABELS, SEEDS, VOLUMES, Goal, planned
 from evaluation.statements import PAPER_VOLUMES, statements_table
 from evaluation.tables import document_parts
@@ -139,6 +139,34 @@ def test_goals() -> None:
     assert cells(table, "real-time factor at 1600, one process, s")[2:] == ["5.90", "**missed**"]
     assert cells(table, "cost")[2:] == ["1.10 times", "holds"]
     assert cells(table, "three points")[3] == "holds"
+
+
+def test_goals_against_tuned_drivers() -> None:
+    def one(label: str, volume: float, travel_s: float, **figures: float) -> PointRow:
+        return changed(point(label, volume, travel_s, seeds=(1,)), **figures)
+
+    rows = [
+        one("formations", 1000.0, 66.3, ttc_below_3_s=0.1),  # 0.45 % longer
+        one("rolling", 1000.0, 66.4, ttc_below_3_s=0.0, co2_g_per_km=133.9),
+        one("rolling", 2400.0, 66.4, ttc_below_3_s=0.0, hard_brakes=2),
+        one("lc2013-tuned", 1000.0, 66.0, co2_g_per_km=133.8),
+    ]
+    table = goals_table(evidence(*rows))
+    found = {
+        (label, name): cells(table, f"`{label}`, from 1000 veh/(lane h): {name}")[2:]
+        for label in ("formations", "rolling")
+        for name in ("below", "braking", "travel", "CO2")
+    }
+    assert found == {
+        ("formations", "below"): ["in 1 of 1 runs", "**missed**"],
+        ("formations", "braking"): ["0 vehicles in 1 runs", "holds"],
+        ("formations", "travel"): ["+0.5 to +0.5 %", "holds"],
+        ("formations", "CO2"): ["+0.0 to +0.0 %", "holds"],
+        ("rolling", "below"): ["in 0 of 2 runs", "holds"],
+        ("rolling", "braking"): ["2 vehicles in 2 runs", "**missed**"],
+        ("rolling", "travel"): ["+0.6 to +0.6 %", "**missed**"],
+        ("rolling", "CO2"): ["+0.1 to +0.1 %", "**missed**"],
+    }
 
 
 def test_points_at_and_beyond_their_goals() -> None:
