@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
-from typing import Final
+import math
+from collections.abc import Collection, Iterator, Sequence
 
 from evaluation.comparisons import OWN, TUNED, TUNED_VOLUMES, difference_of
 from evaluation.evidence import Evidence
+from evaluation.intervals import Difference
 from evaluation.markdown import HOLDS, MISSED, MISSING, markdown, number
 from evaluation.points import PointRow
 from evaluation.programme import (
@@ -16,15 +17,11 @@ from evaluation.programme import (
     MAX_COST_RATIO,
     MIN_FACTORS,
     SEEDS,
+    TUNED_GOALS,
     Goal,
+    TunedGoal,
     planned,
 )
-
-AGAINST_TUNED: Final = (
-    ("travel_s", "travel time", "at most 0.5 % longer", 0.5),
-    ("co2_g_per_km", "CO2", "not above", 0.0),
-)
-"""Goals against tuned drivers: field, name, text and maximum difference [%]."""
 
 
 def goals_table(evidence: Evidence) -> str:
@@ -94,36 +91,64 @@ def _measured(row: PointRow, goal: Goal) -> str:
 
 
 def _against_tuned(evidence: Evidence, label: str) -> Iterator[tuple[str, ...]]:
-    """Yield the goals for an operation at the volumes of the comparison with tuned drivers."""
-    name = f"`{label}`, from {TUNED_VOLUMES[0]:g} veh/(lane h): "
-    at = [(label, volume) for volume in TUNED_VOLUMES if planned(label, volume)]
-    rows = [evidence.by_key[key] for key in at if key in evidence.by_key]
-    below_s = [one for row in rows for one in row.values("ttc_below_3_s")]
-    exposed = sum(one > 0.0 for one in below_s)
-    yield _row(
-        f"{name}below 3 s to collision", "never", f"in {exposed} of {len(below_s)} runs",
-        [one == 0.0 for one in below_s],
-    )  # fmt: skip
-    hard = [one for row in rows for one in row.values("hard_brakes")]
-    yield _row(
-        f"{name}braking harder than 5 m/s2", "never", f"{sum(hard):g} vehicles in {len(hard)} runs",
-        [one == 0.0 for one in hard],
-    )  # fmt: skip
-    for figure, what, required, max_percent in AGAINST_TUNED:
-        percent = list(_differences_percent(evidence, label, figure))
-        low, high = min(percent, default=0.0), max(percent, default=0.0)
-        yield _row(
-            f"{name}{what} against tuned drivers", required, f"{low:+.1f} to {high:+.1f} %",
-            [one <= max_percent for one in percent],
-        )  # fmt: skip
+    """Yield the goals for an operation at all volumes of the comparison with tuned drivers."""
+    volumes = [volume for volume in TUNED_VOLUMES if planned(label, volume)]
+    name = f"`{label}`, {volumes[0]:g} to {volumes[-1]:g} veh/(lane h): "
+    rows = [evidence.by_key.get((label, volume)) for volume in volumes]
+    yield f"{name}below 3 s to collision", *_never("ttc_below_3_s", rows)
+    yield f"{name}vehicles that brake harder than 5 m/s2", *_never("hard_brakes", rows)
+    for goal in TUNED_GOALS:
+        found = _against(evidence, label, goal)
+        yield f"{name}{goal.name} against tuned drivers", goal.requirement, *found
 
 
-def _differences_percent(evidence: Evidence, label: str, figure: str) -> Iterator[float]:
-    """Yield the differences of means to each of the tuned drivers at each volume [%]."""
+def _never(figure: str, rows: Sequence[PointRow | None]) -> tuple[str, str, str]:
+    """Return requirement, measured value and verdict of what must not happen in any run.
+
+    Runs that failed count as if it had happened.
+    """
+    listed = [row.runs for row in rows if row is not None]
+    values = [getattr(run, figure) if run.complete else math.inf for runs in listed for run in runs]
+    if len(listed) < len(rows) or None in values:
+        return "never", MISSING, ""
+    happened = sum(value > 0.0 for value in values)
+    return "never", f"in {happened} of {len(values)} runs", _verdict(not happened)
+
+
+def _against(evidence: Evidence, label: str, goal: TunedGoal) -> tuple[str, str]:
+    """Return measured value and verdict of a comparison with all tuned drivers.
+
+    Where all runs of a driver failed, it is named instead of compared.
+    """
+    found: dict[tuple[str, float], Difference] = {}
+    failed = []
     for volume, other in itertools.product(TUNED_VOLUMES, TUNED):
-        found = difference_of(evidence, label, other, volume, figure)
-        if found is not None and (mean := evidence.by_key[other, volume].mean(figure)):
-            yield 100.0 * found.mean / mean
+        if not (planned(label, volume) and planned(other, volume)):
+            continue
+        one = difference_of(evidence, label, other, volume, goal.figure)
+        row = evidence.by_key.get((other, volume))
+        if one is not None:
+            found[other, volume] = one
+        elif row is not None and row.runs and not row.complete:
+            failed.append(f"`{other}` at {volume:g}")
+        else:
+            return MISSING, ""
+    if not found:
+        return MISSING, ""
+    percent = {key: round(one.percent, 2) for key, one in found.items()}
+    worst, volume = max(percent, key=lambda key: percent[key])
+    low, high, seeds = min(percent.values()), max(percent.values()), _seeds(found.values())
+    text = f"{low:+z.2f} to {high:+z.2f} % (highest: `{worst}` at {volume:g}), {seeds}"
+    if failed:
+        text += f"; failed: {', '.join(failed)}"
+    return text, _verdict(high <= goal.max_percent)
+
+
+def _seeds(differences: Collection[Difference]) -> str:
+    """Return how many seeds differences are means of."""
+    counts = [one.seeds for one in differences]
+    few, many = min(counts), max(counts)
+    return f"{few} seeds" if few == many else f"{few} to {many} seeds"
 
 
 def _safety(evidence: Evidence) -> Iterator[tuple[str, ...]]:

@@ -63,6 +63,10 @@ class Difference:
 
     mean: float
     bounds: Interval | None
+    percent: float
+    """The mean, relative to that of the other method over these seeds."""
+    seeds: int
+    """Number of these seeds."""
 
     @property
     def verdict(self) -> Verdict:
@@ -81,7 +85,10 @@ def difference(own: Mapping[int, float], other: Mapping[int, float]) -> Differen
         own: value by seed.
         other: value of the other method by seed.
     """
-    pairs = [own[seed] - other[seed] for seed in sorted(own.keys() & other.keys())]
-    if not pairs:
+    seeds = sorted(own.keys() & other.keys())
+    if not seeds:
         return None
-    return Difference(float(np.mean(pairs)), interval(pairs))
+    pairs = [own[seed] - other[seed] for seed in seeds]
+    mean = float(np.mean(pairs))
+    percent = 100.0 * mean / float(np.mean([other[seed] for seed in seeds]))
+    return Difference(mean, interval(pairs), percent, len(seeds))

@@ -117,6 +117,23 @@ GOALS: Final = (
     Goal("rolling", 2200.0, 67.0, 99.95),
     Goal("rolling", 2400.0, 67.0, 99.9),
 )
+
+
+@frozen
+class TunedGoal:
+    """Requirement on the difference of means to tuned drivers."""
+
+    figure: str
+    """Field of the runs."""
+    name: str
+    requirement: str
+    max_percent: float
+
+
+TUNED_GOALS: Final = (
+    TunedGoal("travel_s", "travel time", "at most 0.5 % longer", 0.5),
+    TunedGoal("co2_g_per_km", "CO2", "not higher", 0.0),
+)
 MIN_FACTORS: Final = {"zenoh": 2.0, "zenoh-50": 5.0, "simulated": 6.0}
 """Minimum real-time factors at 1600 vehicles/(lane h), by trial."""
 MAX_COST_RATIO: Final = 1.2

@@ -7,19 +7,21 @@ Before the rear of the formation is in the stage, vehicles may already move alon
 those in it may change lanes; when its front leaves the stage, those behind may still move.
 
 Plans stay in the blocks of their formations, so their footprints never intersect. But two moves
-towards each other across the border between formations (conflict kind `closing`) would bring the
-vehicles within 2.5 s of a collision, and may trigger the emergency brake. Formations are planned
-one after another, and the later plan pauses for a slot, or has shorter slots, to avoid such moves.
+towards each other across the border between formations (conflict kind `closing`) would reduce the
+time to collision to 0.4 T_F, and may trigger the emergency brake. Formations are planned one after
+another. To avoid such moves, the later plan pauses for a slot; if there is no time for that, its
+slots are shortened.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from functools import partial
 
 from msgspec.structs import replace
 
 from laneweave.coordinator.formations.roster import on_tick, start_time_s
-from laneweave.coordinator.planning.conflict_kinds import ConflictModel, Move
+from laneweave.coordinator.planning.conflict_kinds import CLOSING_COLUMNS, ConflictModel, Move
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.plan_execution import TIME_TOLERANCE_S
@@ -29,6 +31,9 @@ RESERVE_S = 3.0
 """Spare road time after the last slot, for lost messages."""
 MIN_RESERVE_S = 1.0
 """Spare time if `RESERVE_S` would leave too little for comfortable moves."""
+MIN_SHORTENING = 0.65
+"""Minimum ratio between the slots with which a plan has time to pause and those with which it has
+not; even shorter ones would bring vehicles closer to a collision than the conflicts."""
 
 _MODEL = ConflictModel(("closing",))
 
@@ -54,11 +59,12 @@ def paced(
     scenario: Scenario,
     from_m: float | None = None,
 ) -> Plan:
-    """Return a plan with the longest slots with which it ends in time, otherwise the shortest.
+    """Return a plan with the longest slots with which its moves end in time, else the shortest.
 
     The plan pauses where its moves would have `closing` conflicts with those of its neighbours. If
-    there is no time for pauses, its slots are shorter. Only if even the shortest slots leave
-    conflicts does it get the longest ones with which it ends in time in spite of them.
+    there is no time for that, its slots are shortened, by `MIN_SHORTENING` at most. If that is not
+    enough, conflicts remain, and are left to the emergency brake: a late vehicle is better than
+    one in a wrong lane.
 
     Args:
         plan: plan with the latest start: when all of its vehicles are in the stage, and those from
@@ -69,11 +75,12 @@ def paced(
         scenario: road, lattice, T_F.
         from_m: position from which vehicles may change lanes; None: the start of S3.
     """
-    slots_s, slack_s = scenario.timing.slots_s[::-1], scenario.formation.slack_s
+    slots_s = scenario.timing.slots_s[::-1]
     comfortable = [slot_s for slot_s in slots_s if slot_s >= scenario.timing.comfortable_cycle_s]
-    closing: Plan | None = None
+    neighbours = Neighbours(others, scenario.formation.slack_s)
+    conflicting: Plan | None = None
 
-    def in_time(one: Plan, reserve_s: float = 0.0) -> bool:
+    def in_time(one: Plan, reserve_s: float) -> bool:
         return all(
             one.t0_s + (1 + step) * one.slot_s <= end_s(cells) - reserve_s + TIME_TOLERANCE_S
             for moves in one.moves.values()
@@ -84,16 +91,19 @@ def paced(
     for slot_s, reserve_s in (
         *((slot_s, RESERVE_S) for slot_s in comfortable),
         *((slot_s, MIN_RESERVE_S) for slot_s in slots_s),
+        (slots_s[-1], 0.0),
     ):
         t0_s = plan.t0_s
         if len(slots_s) > 1:
             t0_s = _start_s(plan, slot_s, not_before_s, scenario, from_m)
-        last = with_pauses(replace(plan, t0_s=t0_s, slot_s=slot_s), others, slack_s, in_time)
-        if in_time(last, reserve_s):
-            if not closing_steps(last, others, slack_s):
-                return last
-            closing = closing or last
-    return closing or last
+        last = replace(plan, t0_s=t0_s, slot_s=slot_s)
+        too_short = conflicting is not None and slot_s < MIN_SHORTENING * conflicting.slot_s
+        if not too_short and in_time(last, reserve_s):
+            paused = neighbours.with_pauses(last, partial(in_time, reserve_s=reserve_s))
+            if not neighbours.closing_steps(paused):
+                return paused
+            conflicting = conflicting or paused
+    return conflicting or last
 
 
 def _start_s(
@@ -109,58 +119,66 @@ def _start_s(
     return min(plan.t0_s, on_tick(max([not_before_s, *in_time]), scenario))
 
 
-def with_pauses(
-    plan: Plan, others: Sequence[Plan], slack_s: float, in_time: Callable[[Plan], bool]
-) -> Plan:
-    """Return a plan with pauses, so that no move has a `closing` conflict with another plan.
+class Neighbours:
+    """Moves of neighbouring formations with which those of a new plan may have conflicts."""
 
-    All vehicles pause together, so the order of moves does not change.
+    def __init__(self, plans: Iterable[Plan], slack_s: float) -> None:
+        """Collect the moves by a column, by their first column.
 
-    Args:
-        plan: the new plan.
-        others: plans of neighbouring formations; not changed.
-        slack_s: difference between the length of a slot and the duration of a move [s].
-        in_time: returns whether a plan ends in time. Conflicts that remain are left to the
-            emergency brake, because a late vehicle is better than one in a wrong lane.
-    """
-    while closing := closing_steps(plan, others, slack_s):
-        paused = _paused(plan, min(closing))
-        if not in_time(paused):
-            break
-        plan = paused
-    return plan
+        Args:
+            plans: plans of the neighbouring formations; not changed.
+            slack_s: difference between the length of a slot and the duration of a move [s].
+        """
+        self._slack_s = slack_s
+        self._moves: dict[int, list[tuple[float, float, Move]]] = {}
+        """Begin and end (road time) of moves, and their cells."""
+        for plan in plans:
+            for step, move in _moves_by_column(plan):
+                begin_s = plan.t0_s + step * plan.slot_s
+                timed = (begin_s, begin_s + plan.slot_s - slack_s, move)
+                self._moves.setdefault(move[0][0], []).append(timed)
 
+    def closing_steps(self, plan: Plan) -> set[int]:
+        """Return the steps of a plan whose moves have `closing` conflicts with the neighbours."""
+        if not self._moves:
+            return set()
+        return {step for step, move in _moves_by_column(plan) if self._closes_up(plan, step, move)}
 
-def closing_steps(plan: Plan, others: Iterable[Plan], slack_s: float) -> set[int]:
-    """Return the steps in which moves of a plan have `closing` conflicts with other plans.
+    def with_pauses(self, plan: Plan, in_time: Callable[[Plan], bool]) -> Plan:
+        """Return a plan with pauses, so that no move has a `closing` conflict.
 
-    Args:
-        plan: the plan.
-        others: plans of neighbouring formations.
-        slack_s: as in `with_pauses`.
-    """
-    theirs = [
-        (other.t0_s + step * other.slot_s, other.slot_s - slack_s, (origin, target))
-        for other in others
-        for moves in other.moves.values()
-        for step, origin, target in moves
-    ]
+        All vehicles pause together, so the order of moves does not change. Conflicts remain if a
+        plan with a further pause would not end in time.
 
-    def closes_up(step: int, move: Move) -> bool:
+        Args:
+            plan: the new plan.
+            in_time: returns whether a plan ends in time.
+        """
+        while closing := self.closing_steps(plan):
+            paused = _paused(plan, min(closing))
+            if not in_time(paused):
+                break
+            plan = paused
+        return plan
+
+    def _closes_up(self, plan: Plan, step: int, move: Move) -> bool:
         begin_s = plan.t0_s + step * plan.slot_s
+        end_s = begin_s + plan.slot_s - self._slack_s
         return any(
-            begin_s < other_s + other_lasts_s - TIME_TOLERANCE_S
-            and other_s < begin_s + plan.slot_s - slack_s - TIME_TOLERANCE_S
-            and _MODEL.kind(move, other) is not None
-            for other_s, other_lasts_s, other in theirs
+            begin_s < their_end_s - TIME_TOLERANCE_S
+            and their_begin_s < end_s - TIME_TOLERANCE_S
+            and _MODEL.kind(move, theirs) is not None
+            for offset in (-CLOSING_COLUMNS, CLOSING_COLUMNS)
+            for their_begin_s, their_end_s, theirs in self._moves.get(move[0][0] + offset, ())
         )
 
-    return {
-        step
-        for moves in plan.moves.values()
-        for step, origin, target in moves
-        if closes_up(step, (origin, target))
-    }
+
+def _moves_by_column(plan: Plan) -> Iterator[tuple[int, Move]]:
+    """Yield the moves of a plan that change the column, with their steps."""
+    for moves in plan.moves.values():
+        for step, origin, target in moves:
+            if origin[0] != target[0]:
+                yield step, (origin, target)
 
 
 def _paused(plan: Plan, pause: int) -> Plan:

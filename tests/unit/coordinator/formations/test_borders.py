@@ -8,7 +8,7 @@ import pytest
 from attrs import evolve
 
 from laneweave.coordinator.ballots.ballot_round import BallotPhase
-from laneweave.coordinator.formations.pacing import steps_of, with_pauses
+from laneweave.coordinator.formations.pacing import Neighbours, steps_of
 from laneweave.coordinator.planning.conflict_kinds import ConflictModel
 from laneweave.protocol.lattice import PlannedMove
 from laneweave.protocol.runtime.node import Compute, Effect, run_job
@@ -71,7 +71,7 @@ def steps(plan: Plan) -> list[list[int]]:
 
 def test_all_pause_before_the_slot_in_which_two_would_close_up() -> None:
     assert closing_pairs(UP, back(1))
-    plan = with_pauses(UP, [back(1)], SLACK_S, fits(MAX_STEPS))
+    plan = Neighbours([back(1)], SLACK_S).with_pauses(UP, fits(MAX_STEPS))
     assert closing_pairs(plan, back(1)) == []
     assert steps(plan) == [[0, 2, 3], [0, 3]]
     cells = [[move[1:] for move in moves] for moves in plan.moves.values()]
@@ -80,35 +80,38 @@ def test_all_pause_before_the_slot_in_which_two_would_close_up() -> None:
 
 
 def test_the_plan_of_the_block_ahead_pauses_too_if_it_is_the_later_one() -> None:
-    assert steps(with_pauses(back(1), [UP], SLACK_S, fits(MAX_STEPS))) == [[2]]
+    assert steps(Neighbours([UP], SLACK_S).with_pauses(back(1), fits(MAX_STEPS))) == [[2]]
 
 
 def test_it_pauses_again_while_others_come_back() -> None:
     others = [back(1), back(2), back(4)]
-    assert steps(with_pauses(UP, others, SLACK_S, fits(MAX_STEPS))) == [[0, 3, 4], [0, 4]]
+    assert steps(Neighbours(others, SLACK_S).with_pauses(UP, fits(MAX_STEPS))) == [
+        [0, 3, 4],
+        [0, 4],
+    ]
 
 
 @pytest.mark.parametrize("other", [back(0), back(2), back(1, lane=2), back(1, t0_s=T0_S + SLOT_S)])
 def test_moves_at_other_times_or_on_other_lanes_cause_no_pause(other: Plan) -> None:
-    assert with_pauses(UP, [other], SLACK_S, fits(MAX_STEPS)) == UP
+    assert Neighbours([other], SLACK_S).with_pauses(UP, fits(MAX_STEPS)) == UP
 
 
 @pytest.mark.parametrize(("late_s", "expected"), [(-2.0, 2), (2.0, 3), (0.3, 3), (-0.3, 2)])
 def test_slots_that_overlap_count(late_s: float, expected: int) -> None:
     """Blocks need not pass S3 a whole number of slots apart."""
-    plan = with_pauses(UP, [back(1, t0_s=T0_S + late_s)], SLACK_S, fits(MAX_STEPS))
+    plan = Neighbours([back(1, t0_s=T0_S + late_s)], SLACK_S).with_pauses(UP, fits(MAX_STEPS))
     assert closing_pairs(plan, back(1, t0_s=T0_S + late_s)) == []
     assert steps(plan)[0] == [0, expected, expected + 1]
 
 
 def test_a_plan_does_not_outlast_the_road() -> None:
-    assert with_pauses(UP, [back(1)], SLACK_S, fits(3)) == UP
+    assert Neighbours([back(1)], SLACK_S).with_pauses(UP, fits(3)) == UP
 
 
 def test_without_moves_there_is_nothing_to_keep_apart() -> None:
     nobody = plan_of()
     assert steps_of(nobody) == 0
-    assert with_pauses(nobody, [UP], SLACK_S, fits(MAX_STEPS)) == nobody
+    assert Neighbours([UP], SLACK_S).with_pauses(nobody, fits(MAX_STEPS)) == nobody
 
 
 # --- the leader -------------------------------------------------------------------------------

@@ -11,9 +11,8 @@ from laneweave.coordinator.formations import pacing
 from laneweave.coordinator.formations.pacing import (
     MIN_RESERVE_S,
     RESERVE_S,
-    closing_steps,
+    Neighbours,
     steps_of,
-    with_pauses,
 )
 from laneweave.coordinator.formations.roster import exit_time_s, start_time_s
 from laneweave.protocol.lattice import Cell, PlannedMove
@@ -134,7 +133,7 @@ def test_neighbours_with_slots_of_other_lengths_are_kept_apart(
     mine = replace(climbing(1), moves={A: ((0, (-5, 1), (-4, 1)),)}, slot_s=slot_s)
     theirs = replace(mine, moves={A: ((0, (-2, 1), (-3, 1)),)}, slot_s=their_slot_s)
     late = replace(mine, t0_s=mine.t0_s + late_s)
-    paused = with_pauses(late, [theirs], SCENARIO.formation.slack_s, lambda _: True)
+    paused = Neighbours([theirs], SCENARIO.formation.slack_s).with_pauses(late, lambda _: True)
     assert (steps_of(paused) - 1 > 0) is bool(pauses)
 
 
@@ -143,20 +142,24 @@ CLOSING = replace(climbing(0), moves={A: ((0, (-5, 1), (-4, 1)), (1, (-4, 1), (-
 
 
 @pytest.mark.parametrize(
-    ("room_s", "slot_s", "steps"),
+    ("their_slot_s", "room_s", "slot_s", "steps"),
     [
-        (3 * 7.0 + RESERVE_S, 7.0, 3),
-        (3 * 6.6 + RESERVE_S, 6.6, 3),
-        (3 * 4.4 + MIN_RESERVE_S, 4.4, 3),
-        (3 * 4.0 + MIN_RESERVE_S - 0.1, 5.8, 2),  # no pause: the longest slots
+        (4.0, 3 * 7.0 + RESERVE_S, 7.0, 3),
+        (4.0, 3 * 6.6 + RESERVE_S, 6.6, 3),
+        (4.0, 3 * 4.4 + MIN_RESERVE_S, 4.4, 3),
+        (4.0, 3 * 4.0, 4.0, 3),  # even without a reserve
+        (4.0, 3 * 4.0 - 0.1, 5.4, 2),  # no time to pause, whatever the slots
+        (8.9, 4 * 4.6 + MIN_RESERVE_S, 4.6, 4),
+        (8.9, 4 * 4.4 + MIN_RESERVE_S, 7.0, 2),  # pauses would need much shorter slots
     ],
 )
-def test_slots_are_shorter_if_there_is_no_time_for_a_pause_otherwise(
-    room_s: float, slot_s: float, steps: int
+def test_slots_are_shortened_if_there_is_no_time_for_a_pause_otherwise(
+    their_slot_s: float, room_s: float, slot_s: float, steps: int
 ) -> None:
-    theirs = replace(CLOSING, moves={B: ((0, (-2, 1), (-3, 1)),)}, slot_s=4.0)
+    theirs = replace(CLOSING, moves={B: ((0, (-2, 1), (-3, 1)),)}, slot_s=their_slot_s)
     end_s = CLOSING.t0_s + room_s
     chosen = pacing.paced(CLOSING, [theirs], CLOSING.t0_s, lambda _: end_s, SCENARIO)
-    assert (chosen.slot_s, steps_of(chosen)) == (pytest.approx(slot_s), steps)
-    closing = closing_steps(chosen, [theirs], SCENARIO.formation.slack_s)
-    assert closing == (set() if steps > 2 else {0})
+    assert chosen.slot_s == pytest.approx(slot_s)
+    assert steps_of(chosen) == steps
+    neighbours = Neighbours([theirs], SCENARIO.formation.slack_s)
+    assert neighbours.closing_steps(chosen) == (set() if steps > 2 else {0})
