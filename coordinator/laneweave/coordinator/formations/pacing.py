@@ -9,14 +9,16 @@ those in it may change lanes; when its front leaves the stage, those behind may 
 Plans stay in the blocks of their formations, so their footprints never intersect. But two moves
 towards each other across the border between formations (conflict kind `closing`) would reduce the
 time to collision to 0.4 T_F, and may trigger the emergency brake. Formations are planned one after
-another. To avoid such moves, the later plan pauses for a slot; if there is no time for that, its
-slots are shortened.
+another. To avoid such moves, the later plan pauses for a slot; if there is no time for that, it
+begins later by less than a slot, or its slots are shortened.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from functools import partial
+from operator import itemgetter
 
 from msgspec.structs import replace
 
@@ -31,9 +33,8 @@ RESERVE_S = 3.0
 """Spare road time after the last slot, for lost messages."""
 MIN_RESERVE_S = 1.0
 """Spare time if `RESERVE_S` would leave too little for comfortable moves."""
-MIN_SHORTENING = 0.65
-"""Minimum ratio between the slots with which a plan has time to pause and those with which it has
-not; even shorter ones would bring vehicles closer to a collision than the conflicts."""
+DELAY_S = 0.5
+"""Step between starts of a plan that are tried where pauses do not help."""
 
 _MODEL = ConflictModel(("closing",))
 
@@ -62,9 +63,10 @@ def paced(
     """Return a plan with the longest slots with which its moves end in time, else the shortest.
 
     The plan pauses where its moves would have `closing` conflicts with those of its neighbours. If
-    there is no time for that, its slots are shortened, by `MIN_SHORTENING` at most. If that is not
-    enough, conflicts remain, and are left to the emergency brake: a late vehicle is better than
-    one in a wrong lane.
+    there is no time for that, it begins later by less than a slot, or its slots are shortened, but
+    not below the shortest ones with gentle moves: others bring vehicles as close to a collision as
+    conflicts do (decision 76). If that is not enough, the shortest conflict remains, and is left to
+    the emergency brake: a late vehicle is better than one in a wrong lane.
 
     Args:
         plan: plan with the latest start: when all of its vehicles are in the stage, and those from
@@ -77,8 +79,10 @@ def paced(
     """
     slots_s = scenario.timing.slots_s[::-1]
     comfortable = [slot_s for slot_s in slots_s if slot_s >= scenario.timing.comfortable_cycle_s]
+    gentle_s = scenario.timing.gentle_cycle_s
     neighbours = Neighbours(others, scenario.formation.slack_s)
-    conflicting: Plan | None = None
+    conflicting: list[tuple[float, Plan]] = []
+    """Plans that end in time, and how long their conflicts last."""
 
     def in_time(one: Plan, reserve_s: float) -> bool:
         return all(
@@ -97,13 +101,24 @@ def paced(
         if len(slots_s) > 1:
             t0_s = _start_s(plan, slot_s, not_before_s, scenario, from_m)
         last = replace(plan, t0_s=t0_s, slot_s=slot_s)
-        too_short = conflicting is not None and slot_s < MIN_SHORTENING * conflicting.slot_s
-        if not too_short and in_time(last, reserve_s):
-            paused = neighbours.with_pauses(last, partial(in_time, reserve_s=reserve_s))
-            if not neighbours.closing_steps(paused):
-                return paused
-            conflicting = conflicting or paused
-    return conflicting or last
+        too_short = conflicting and slot_s < gentle_s <= conflicting[0][1].slot_s
+        if too_short or not in_time(last, reserve_s):
+            continue
+        paused = neighbours.with_pauses(last, partial(in_time, reserve_s=reserve_s))
+        for one in (paused, *_later(last, scenario)):
+            if not in_time(one, reserve_s):
+                break
+            conflict_s = max(neighbours.conflicts_s(one).values(), default=0.0)
+            if not conflict_s:
+                return one
+            conflicting.append((conflict_s, one))
+    return min(conflicting, key=itemgetter(0))[1] if conflicting else last
+
+
+def _later(plan: Plan, scenario: Scenario) -> Iterator[Plan]:
+    """Yield the plan with starts that are later by less than a slot."""
+    for number in range(1, math.ceil(plan.slot_s / DELAY_S)):
+        yield replace(plan, t0_s=on_tick(plan.t0_s + number * DELAY_S, scenario))
 
 
 def _start_s(
@@ -138,11 +153,21 @@ class Neighbours:
                 timed = (begin_s, begin_s + plan.slot_s - slack_s, move)
                 self._moves.setdefault(move[0][0], []).append(timed)
 
-    def closing_steps(self, plan: Plan) -> set[int]:
-        """Return the steps of a plan whose moves have `closing` conflicts with the neighbours."""
-        if not self._moves:
-            return set()
-        return {step for step, move in _moves_by_column(plan) if self._closes_up(plan, step, move)}
+    def conflicts_s(self, plan: Plan) -> dict[int, float]:
+        """Return the steps of a plan whose moves have `closing` conflicts, and how long these last.
+
+        A conflict lasts as long as both moves are under way.
+        """
+        found: dict[int, float] = {}
+        for step, move in _moves_by_column(plan) if self._moves else ():
+            begin_s = plan.t0_s + step * plan.slot_s
+            end_s = begin_s + plan.slot_s - self._slack_s
+            for offset in (-CLOSING_COLUMNS, CLOSING_COLUMNS):
+                for their_begin_s, their_end_s, theirs in self._moves.get(move[0][0] + offset, ()):
+                    both_s = min(end_s, their_end_s) - max(begin_s, their_begin_s)
+                    if both_s > TIME_TOLERANCE_S and _MODEL.kind(move, theirs) is not None:
+                        found[step] = max(both_s, found.get(step, 0.0))
+        return found
 
     def with_pauses(self, plan: Plan, in_time: Callable[[Plan], bool]) -> Plan:
         """Return a plan with pauses, so that no move has a `closing` conflict.
@@ -154,23 +179,12 @@ class Neighbours:
             plan: the new plan.
             in_time: returns whether a plan ends in time.
         """
-        while closing := self.closing_steps(plan):
-            paused = _paused(plan, min(closing))
+        while conflicts_s := self.conflicts_s(plan):
+            paused = _paused(plan, min(conflicts_s))
             if not in_time(paused):
                 break
             plan = paused
         return plan
-
-    def _closes_up(self, plan: Plan, step: int, move: Move) -> bool:
-        begin_s = plan.t0_s + step * plan.slot_s
-        end_s = begin_s + plan.slot_s - self._slack_s
-        return any(
-            begin_s < their_end_s - TIME_TOLERANCE_S
-            and their_begin_s < end_s - TIME_TOLERANCE_S
-            and _MODEL.kind(move, theirs) is not None
-            for offset in (-CLOSING_COLUMNS, CLOSING_COLUMNS)
-            for their_begin_s, their_end_s, theirs in self._moves.get(move[0][0] + offset, ())
-        )
 
 
 def _moves_by_column(plan: Plan) -> Iterator[tuple[int, Move]]:

@@ -14,11 +14,14 @@ from laneweave.protocol.scenario.vehicle_tables import PEAK_ACCEL, Vehicle
 
 SHORTEST_CYCLE_S, LONGEST_CYCLE_S = 4.0, 7.0
 """Range of T_F if `formation.cycle_s` is not set; the lower end is the paper's value."""
-GENTLE_MPS2 = 3.0
+COMFORTABLE_MPS2 = 3.0
 """Maximum acceleration of minimum-jerk moves within the comfortable T_F."""
 ROLLING_CYCLES_S = ((2000.0, 6.0), (2200.0, 5.4), (math.inf, 5.0))
 """Volumes [vehicles/(lane h)] in ascending order, and T_F [s] of the rolling operation up to each;
 denser traffic needs more steps on the same road (decision 76)."""
+GENTLE_RATIO = 0.9
+"""Maximum acceleration of a minimum-jerk move, divided by the limit, up to which there is a gentle
+move of the same duration (decision 76), if d_F is 12 m or more."""
 MIN_MERGING_SLOTS = 4
 """Number of slots that the rolling operation should have in a lane that begins and ends on the
 road, as that of a ramp; with three, up to 1 % of the vehicles did not change lanes in time at 2000
@@ -98,14 +101,22 @@ class Timing:
 
     @property
     def comfortable_cycle_s(self) -> float:
-        """Shortest T_F [s] in which no minimum-jerk move exceeds `GENTLE_MPS2`, or the longest.
+        """Shortest T_F [s] with minimum-jerk moves within `COMFORTABLE_MPS2`, or the longest.
 
         Gentle moves (decision 76) may exceed it slightly if d_F is short.
         """
         formation = self._formation
-        min_s = math.sqrt(PEAK_ACCEL * formation.gap_m / GENTLE_MPS2)
+        min_s = math.sqrt(PEAK_ACCEL * formation.gap_m / COMFORTABLE_MPS2)
         comfortable = [slot_s for slot_s in self.slots_s if slot_s >= min_s + formation.slack_s]
         return min(comfortable, default=self.slots_s[-1])
+
+    @property
+    def gentle_cycle_s(self) -> float:
+        """Shortest T_F [s] in which moves by a column are gentle (decision 76), or the longest."""
+        formation = self._formation
+        accel_mps2 = GENTLE_RATIO * self._cars.max_accel_mps2
+        min_s = math.sqrt(PEAK_ACCEL * formation.gap_m / accel_mps2) + formation.slack_s
+        return min((one for one in self.slots_s if one >= min_s), default=self.slots_s[-1])
 
     @property
     def horizon_ticks(self) -> int:

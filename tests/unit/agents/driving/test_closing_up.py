@@ -155,6 +155,17 @@ def test_moves_keep_what_the_limits_allow() -> None:
     assert min_ttc_s(parse_scenario({"formation": {"gap_m": 20.0, "cycle_s": 4.6}}), -1) < 2.9
 
 
+@pytest.mark.parametrize(
+    ("gap_m", "max_accel_mps2"), [(12.0, 3.5), (15.0, 5.0), (15.0, 3.0), (20.0, 5.0), (25.0, 5.0)]
+)
+def test_the_shortest_slots_with_gentle_moves(gap_m: float, max_accel_mps2: float) -> None:
+    tables = {"formation": {"gap_m": gap_m}, "vehicle": {"max_accel_mps2": max_accel_mps2}}
+    gentle_s = parse_scenario(tables).timing.gentle_cycle_s
+    tables["formation"]["cycle_s"] = gentle_s
+    assert min_ttc_s(parse_scenario(tables), 1) >= MIN_TTC_S - 0.01
+    assert SCENARIO.timing.gentle_cycle_s == pytest.approx(4.6)
+
+
 def min_ttc_s(scenario: Scenario, dx: int) -> float:
     """Return the time to collision of a planned move with a vehicle that holds beyond."""
     _, v, *_ = (states := move_profile(scenario, scenario.vehicle, dx, 0).states).T

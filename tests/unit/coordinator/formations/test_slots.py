@@ -141,25 +141,55 @@ CLOSING = replace(climbing(0), moves={A: ((0, (-5, 1), (-4, 1)), (1, (-4, 1), (-
 """A vehicle moves forwards, and then to another lane."""
 
 
-@pytest.mark.parametrize(
-    ("their_slot_s", "room_s", "slot_s", "steps"),
-    [
-        (4.0, 3 * 7.0 + RESERVE_S, 7.0, 3),
-        (4.0, 3 * 6.6 + RESERVE_S, 6.6, 3),
-        (4.0, 3 * 4.4 + MIN_RESERVE_S, 4.4, 3),
-        (4.0, 3 * 4.0, 4.0, 3),  # even without a reserve
-        (4.0, 3 * 4.0 - 0.1, 5.4, 2),  # no time to pause, whatever the slots
-        (8.9, 4 * 4.6 + MIN_RESERVE_S, 4.6, 4),
-        (8.9, 4 * 4.4 + MIN_RESERVE_S, 7.0, 2),  # pauses would need much shorter slots
-    ],
-)
-def test_slots_are_shortened_if_there_is_no_time_for_a_pause_otherwise(
-    their_slot_s: float, room_s: float, slot_s: float, steps: int
-) -> None:
+def beside(their_slot_s: float, room_s: float, scenario: Scenario) -> tuple[Plan, set[int]]:
+    """Return the plan beside one with a closing move in its first slot, and its conflicts."""
     theirs = replace(CLOSING, moves={B: ((0, (-2, 1), (-3, 1)),)}, slot_s=their_slot_s)
     end_s = CLOSING.t0_s + room_s
-    chosen = pacing.paced(CLOSING, [theirs], CLOSING.t0_s, lambda _: end_s, SCENARIO)
-    assert chosen.slot_s == pytest.approx(slot_s)
+    chosen = pacing.paced(CLOSING, [theirs], CLOSING.t0_s, lambda _: end_s, scenario)
+    neighbours = Neighbours([theirs], scenario.formation.slack_s)
+    return chosen, set(neighbours.conflicts_s(chosen))
+
+
+@pytest.mark.parametrize(
+    ("their_slot_s", "room_s", "slot_s", "steps", "late_s"),
+    [
+        (4.0, 3 * 7.0 + RESERVE_S, 7.0, 3, 0.0),  # with a pause
+        (4.0, 2 * 7.0 + 4.0 + RESERVE_S, 7.0, 2, 4.0),  # with a later start
+        (4.0, 2 * 6.4 + 4.0 + RESERVE_S, 6.4, 2, 4.0),
+        (4.0, 2 * 4.6 + 4.0 + MIN_RESERVE_S, 4.6, 2, 4.0),
+        (8.9, 4 * 4.6 + MIN_RESERVE_S, 4.6, 4, 0.0),
+    ],
+)
+def test_a_plan_pauses_or_begins_later_or_its_slots_are_shortened(
+    their_slot_s: float, room_s: float, slot_s: float, steps: int, late_s: float
+) -> None:
+    chosen, conflicts = beside(their_slot_s, room_s, SCENARIO)
+    assert (chosen.slot_s, chosen.t0_s - CLOSING.t0_s) == pytest.approx((slot_s, late_s))
     assert steps_of(chosen) == steps
-    neighbours = Neighbours([theirs], SCENARIO.formation.slack_s)
-    assert neighbours.closing_steps(chosen) == (set() if steps > 2 else {0})
+    assert not conflicts
+
+
+@pytest.mark.parametrize(
+    ("their_slot_s", "room_s", "slot_s", "late_s"),
+    [
+        (8.9, 4 * 4.4 + MIN_RESERVE_S, 5.8, 0.0),  # two pauses would need too short slots
+        (4.0, 2 * 5.4 + MIN_RESERVE_S, 4.6, 1.5),
+        (4.0, 2 * 4.4 + MIN_RESERVE_S, 4.0, 1.5),  # there is no time for gentle moves at all
+    ],
+)
+def test_the_shortest_conflict_remains_if_slots_would_be_too_short(
+    their_slot_s: float, room_s: float, slot_s: float, late_s: float
+) -> None:
+    chosen, conflicts = beside(their_slot_s, room_s, SCENARIO)
+    assert (chosen.slot_s, chosen.t0_s - CLOSING.t0_s) == pytest.approx((slot_s, late_s))
+    assert len(conflicts) == 1
+
+
+def test_a_pause_may_take_the_reserve() -> None:
+    scenario = Scenario(formation=FormationSettings(cycle_s=5.0))
+    chosen, conflicts = beside(5.0, 3 * 5.0, scenario)
+    assert steps_of(chosen) == 3
+    assert not conflicts
+    chosen, conflicts = beside(5.0, 3 * 5.0 - 0.1, scenario)
+    assert steps_of(chosen) == 2
+    assert conflicts == {0}
