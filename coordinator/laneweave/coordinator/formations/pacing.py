@@ -36,6 +36,10 @@ MIN_RESERVE_S = 1.0
 DELAY_S = 0.5
 """Step between starts of a plan that are tried where pauses do not help."""
 
+SHORT_CONFLICT_S = 2.5
+"""Duration up to which two moves that close up keep 3 s to collision, if their slots are not
+shorter than `Timing.brisk_cycle_s`."""
+
 _MODEL = ConflictModel(("closing",))
 
 
@@ -63,10 +67,11 @@ def paced(
     """Return a plan with the longest slots with which its moves end in time, else the shortest.
 
     The plan pauses where its moves would have `closing` conflicts with those of its neighbours. If
-    there is no time for that, it begins later by less than a slot, or its slots are shortened, but
-    not below the shortest ones with gentle moves: others bring vehicles as close to a collision as
-    conflicts do (decision 76). If that is not enough, the shortest conflict remains, and is left to
-    the emergency brake: a late vehicle is better than one in a wrong lane.
+    there is no time for that, it begins later by less than a slot, or its slots are shortened: to
+    `Timing.brisk_cycle_s` if a short conflict would remain otherwise, to `Timing.gentle_cycle_s` if
+    a long one would. Even shorter slots bring vehicles as close to a collision as conflicts do
+    (decision 76). If that is not enough, the shortest conflict remains, and is left to the
+    emergency brake: a late vehicle is better than one in a wrong lane.
 
     Args:
         plan: plan with the latest start: when all of its vehicles are in the stage, and those from
@@ -78,11 +83,19 @@ def paced(
         from_m: position from which vehicles may change lanes; None: the start of S3.
     """
     slots_s = scenario.timing.slots_s[::-1]
-    comfortable = [slot_s for slot_s in slots_s if slot_s >= scenario.timing.comfortable_cycle_s]
-    gentle_s = scenario.timing.gentle_cycle_s
+    timing = scenario.timing
+    comfortable = [slot_s for slot_s in slots_s if slot_s >= timing.comfortable_cycle_s]
     neighbours = Neighbours(others, scenario.formation.slack_s)
     conflicting: list[tuple[float, Plan]] = []
     """Plans that end in time, and how long their conflicts last."""
+
+    def min_slot_s() -> float:
+        """Return to which length slots may be shortened to avoid the conflicts found so far."""
+        if not conflicting:
+            return 0.0
+        is_short = min(conflict_s for conflict_s, _ in conflicting) <= SHORT_CONFLICT_S
+        limits_s = (timing.brisk_cycle_s if is_short else 0.0, timing.gentle_cycle_s)
+        return max((one for one in limits_s if one <= conflicting[0][1].slot_s), default=0.0)
 
     def in_time(one: Plan, reserve_s: float) -> bool:
         return all(
@@ -101,8 +114,7 @@ def paced(
         if len(slots_s) > 1:
             t0_s = _start_s(plan, slot_s, not_before_s, scenario, from_m)
         last = replace(plan, t0_s=t0_s, slot_s=slot_s)
-        too_short = conflicting and slot_s < gentle_s <= conflicting[0][1].slot_s
-        if too_short or not in_time(last, reserve_s):
+        if slot_s < min_slot_s() or not in_time(last, reserve_s):
             continue
         paused = neighbours.with_pauses(last, partial(in_time, reserve_s=reserve_s))
         for one in (paused, *_later(last, scenario)):

@@ -14,8 +14,8 @@ from laneweave.protocol.scenario.vehicle_tables import PEAK_ACCEL, Vehicle
 
 SHORTEST_CYCLE_S, LONGEST_CYCLE_S = 4.0, 7.0
 """Range of T_F if `formation.cycle_s` is not set; the lower end is the paper's value."""
-COMFORTABLE_MPS2 = 3.0
-"""Maximum acceleration of minimum-jerk moves within the comfortable T_F."""
+COMFORTABLE_MPS2, BRISK_MPS2 = 3.0, 3.5
+"""Maximum acceleration of minimum-jerk moves in the comfortable T_F, and in the brisk one."""
 ROLLING_CYCLES_S = ((2000.0, 6.0), (2200.0, 5.4), (math.inf, 5.0))
 """Volumes [vehicles/(lane h)] in ascending order, and T_F [s] of the rolling operation up to each;
 denser traffic needs more steps on the same road (decision 76)."""
@@ -105,18 +105,23 @@ class Timing:
 
         Gentle moves (decision 76) may exceed it slightly if d_F is short.
         """
-        formation = self._formation
-        min_s = math.sqrt(PEAK_ACCEL * formation.gap_m / COMFORTABLE_MPS2)
-        comfortable = [slot_s for slot_s in self.slots_s if slot_s >= min_s + formation.slack_s]
-        return min(comfortable, default=self.slots_s[-1])
+        return self._shortest_within(COMFORTABLE_MPS2)
+
+    @property
+    def brisk_cycle_s(self) -> float:
+        """The same within `BRISK_MPS2`, but with gentle moves."""
+        return max(self._shortest_within(BRISK_MPS2), self.gentle_cycle_s)
 
     @property
     def gentle_cycle_s(self) -> float:
-        """Shortest T_F [s] in which moves by a column are gentle (decision 76), or the longest."""
-        formation = self._formation
-        accel_mps2 = GENTLE_RATIO * self._cars.max_accel_mps2
-        min_s = math.sqrt(PEAK_ACCEL * formation.gap_m / accel_mps2) + formation.slack_s
-        return min((one for one in self.slots_s if one >= min_s), default=self.slots_s[-1])
+        """Shortest T_F [s] in which moves by a column are gentle, or the longest."""
+        return self._shortest_within(GENTLE_RATIO * self._cars.max_accel_mps2)
+
+    def _shortest_within(self, accel_mps2: float) -> float:
+        """Return the shortest T_F [s] with minimum-jerk moves within a limit, or the longest."""
+        min_s = math.sqrt(PEAK_ACCEL * self._formation.gap_m / accel_mps2)
+        enough = (one for one in self.slots_s if one >= min_s + self._formation.slack_s)
+        return min(enough, default=self.slots_s[-1])
 
     @property
     def horizon_ticks(self) -> int:

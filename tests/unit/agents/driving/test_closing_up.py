@@ -160,10 +160,11 @@ def test_moves_keep_what_the_limits_allow() -> None:
 )
 def test_the_shortest_slots_with_gentle_moves(gap_m: float, max_accel_mps2: float) -> None:
     tables = {"formation": {"gap_m": gap_m}, "vehicle": {"max_accel_mps2": max_accel_mps2}}
-    gentle_s = parse_scenario(tables).timing.gentle_cycle_s
-    tables["formation"]["cycle_s"] = gentle_s
+    tables["formation"]["cycle_s"] = parse_scenario(tables).timing.gentle_cycle_s
     assert min_ttc_s(parse_scenario(tables), 1) >= MIN_TTC_S - 0.01
-    assert SCENARIO.timing.gentle_cycle_s == pytest.approx(4.6)
+    timing = SCENARIO.timing
+    slots_s = (timing.gentle_cycle_s, timing.brisk_cycle_s, timing.comfortable_cycle_s)
+    assert slots_s == pytest.approx((4.6, 5.2, 5.6))
 
 
 def min_ttc_s(scenario: Scenario, dx: int) -> float:

@@ -156,8 +156,9 @@ def beside(their_slot_s: float, room_s: float, scenario: Scenario) -> tuple[Plan
         (4.0, 3 * 7.0 + RESERVE_S, 7.0, 3, 0.0),  # with a pause
         (4.0, 2 * 7.0 + 4.0 + RESERVE_S, 7.0, 2, 4.0),  # with a later start
         (4.0, 2 * 6.4 + 4.0 + RESERVE_S, 6.4, 2, 4.0),
-        (4.0, 2 * 4.6 + 4.0 + MIN_RESERVE_S, 4.6, 2, 4.0),
-        (8.9, 4 * 4.6 + MIN_RESERVE_S, 4.6, 4, 0.0),
+        (4.0, 2 * 5.2 + 4.0 + MIN_RESERVE_S, 5.2, 2, 4.0),
+        (8.9, 4 * 5.2 + MIN_RESERVE_S, 5.2, 4, 0.0),
+        (8.9, 4 * 4.6 + MIN_RESERVE_S, 4.6, 4, 0.0),  # instead of a long conflict
     ],
 )
 def test_a_plan_pauses_or_begins_later_or_its_slots_are_shortened(
@@ -174,7 +175,13 @@ def test_a_plan_pauses_or_begins_later_or_its_slots_are_shortened(
     [
         (8.9, 4 * 4.4 + MIN_RESERVE_S, 5.8, 0.0),  # two pauses would need too short slots
         (4.0, 2 * 5.4 + MIN_RESERVE_S, 4.6, 1.5),
-        (4.0, 2 * 4.4 + MIN_RESERVE_S, 4.0, 1.5),  # there is no time for gentle moves at all
+        (
+            4.0,
+            2 * 4.6 + 4.0 + MIN_RESERVE_S,
+            5.2,
+            2.5,
+        ),  # a short conflict, slots of 4.6 s would avoid it
+        (4.0, 2 * 4.4 + MIN_RESERVE_S, 4.0, 1.5),  # there is no time for longer slots at all
     ],
 )
 def test_the_shortest_conflict_remains_if_slots_would_be_too_short(
