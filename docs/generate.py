@@ -36,6 +36,7 @@ from api_reference import api_reference, documented
 from command_reference import command_reference
 from conflict_drawing import counts, draw_conflicts
 from evaluation.evidence import read_evidence
+from evaluation.markdown import markdown
 from evaluation.tables import document_parts
 from experiments import P
 from laneweave import methods, planners
@@ -845,8 +846,7 @@ def _sensitivity() -> str:
         result_row(name, one["text"], Result(**{key: one[key] for key in fields_dict(Result)}))
         for name, one in levels
     ]
-    lines = [f"| {' | '.join(row)} |" for row in (HEADINGS, *rows)]
-    lines.insert(1, "|---" * len(HEADINGS) + "|")
+    lines = [markdown(HEADINGS, rows)]
     refused = [f"- {reason}" for one in study["factors"] for reason in one["refused"]]
     if refused:
         lines += ["", "Impossible on this road:", "", *refused]

@@ -10,7 +10,7 @@ from evaluation.evidence import Evidence
 from evaluation.intervals import MIN_SEEDS, Difference, Verdict, difference
 from evaluation.markdown import MISSING, NOT_RUN, markdown, number
 from evaluation.points import PointRow
-from evaluation.programme import FORMATIONS, LABELS, VOLUMES, planned
+from evaluation.programme import FORMATIONS, LABELS, TUNED_GOALS, VOLUMES, planned
 
 OWN: Final = ("formations", "rolling")
 """Labels that are compared: the two operations with their default settings."""
@@ -26,8 +26,6 @@ WORDS: Final = {
     Verdict.UNKNOWN: "not compared with",
 }
 """What a difference of travel times means, in the order of the sentences."""
-COMPARED: Final = (("travel_s", "travel time", "s"), ("co2_g_per_km", "CO2", "g/km"))
-"""Figures that are compared with tuned drivers: their fields, names and units."""
 _COMPARED_WORDS: Final = {
     Verdict.LESS: "less",
     Verdict.MORE: "**more**",
@@ -71,14 +69,14 @@ def tuned_comparison(evidence: Evidence) -> str:
     sentences, without = [], dict[str, None]()
     for volume, own, other in itertools.product(TUNED_VOLUMES, OWN, TUNED):
         found = {
-            (name, unit): one
-            for figure, name, unit in COMPARED
-            if (one := difference_of(evidence, own, other, volume, figure)) is not None
+            goal: one
+            for goal in TUNED_GOALS
+            if (one := difference_of(evidence, own, other, volume, goal.figure)) is not None
         }
         words = [
-            f"{name} {_COMPARED_WORDS[one.verdict]} ({one.mean:+.2f} {unit}, "
+            f"{goal.name} {_COMPARED_WORDS[one.verdict]} ({one.mean:+.2f} {goal.unit}, "
             f"{one.bounds.low:+.2f} to {one.bounds.high:+.2f})"
-            for (name, unit), one in found.items()
+            for goal, one in found.items()
             if one.bounds is not None
         ]
         if words:

@@ -103,9 +103,9 @@ def _against_tuned(evidence: Evidence, label: str) -> Iterator[tuple[str, ...]]:
 
 
 def _never(figure: str, rows: Sequence[PointRow | None]) -> tuple[str, str, str]:
-    """Return requirement, measured value and verdict of what must not happen in any run.
+    """Return requirement, measured value and verdict for a figure that must be 0 in every run.
 
-    Runs that failed count as if it had happened.
+    Runs that failed count as runs in which it is not 0.
     """
     listed = [row.runs for row in rows if row is not None]
     values = [getattr(run, figure) if run.complete else math.inf for runs in listed for run in runs]

@@ -64,7 +64,7 @@ class Difference:
     mean: float
     bounds: Interval | None
     percent: float
-    """The mean, relative to that of the other method over these seeds."""
+    """The mean difference, relative to the mean of the other method over these seeds [%]."""
     seeds: int
     """Number of these seeds."""
 

@@ -121,18 +121,22 @@ GOALS: Final = (
 
 @frozen
 class TunedGoal:
-    """Requirement on the difference of means to tuned drivers."""
+    """Maximum difference between the mean of a figure and that of tuned drivers."""
 
     figure: str
-    """Field of the runs."""
+    """Name of a field of `RunRow`."""
     name: str
+    """The figure in words."""
+    unit: str
     requirement: str
+    """The maximum in words."""
     max_percent: float
+    """Maximum, relative to the mean of the tuned drivers [%]."""
 
 
 TUNED_GOALS: Final = (
-    TunedGoal("travel_s", "travel time", "at most 0.5 % longer", 0.5),
-    TunedGoal("co2_g_per_km", "CO2", "not higher", 0.0),
+    TunedGoal("travel_s", "travel time", "s", "at most 0.5 % longer", 0.5),
+    TunedGoal("co2_g_per_km", "CO2", "g/km", "not higher", 0.0),
 )
 MIN_FACTORS: Final = {"zenoh": 2.0, "zenoh-50": 5.0, "simulated": 6.0}
 """Minimum real-time factors at 1600 vehicles/(lane h), by trial."""

@@ -34,10 +34,10 @@ RESERVE_S = 3.0
 MIN_RESERVE_S = 1.0
 """Spare time if `RESERVE_S` would leave too little for comfortable moves."""
 DELAY_S = 0.5
-"""Step between starts of a plan that are tried where pauses do not help."""
+"""Step between the later starts of a plan that are tried if conflicts remain in spite of pauses."""
 
 SHORT_CONFLICT_S = 2.5
-"""Duration up to which two moves that close up keep 3 s to collision, if their slots are not
+"""Maximum duration of a conflict in which vehicles keep 3 s to collision, if the slots are not
 shorter than `Timing.brisk_cycle_s`."""
 
 _MODEL = ConflictModel(("closing",))
@@ -64,7 +64,7 @@ def paced(
     scenario: Scenario,
     from_m: float | None = None,
 ) -> Plan:
-    """Return a plan with the longest slots with which its moves end in time, else the shortest.
+    """Return a plan with the longest slots with which it ends in time; if none, with the shortest.
 
     The plan pauses where its moves would have `closing` conflicts with those of its neighbours. If
     there is no time for that, it begins later by less than a slot, or its slots are shortened: to
@@ -82,15 +82,15 @@ def paced(
         scenario: road, lattice, T_F.
         from_m: position from which vehicles may change lanes; None: the start of S3.
     """
-    slots_s = scenario.timing.slots_s[::-1]
     timing = scenario.timing
+    slots_s = timing.slots_s[::-1]
     comfortable = [slot_s for slot_s in slots_s if slot_s >= timing.comfortable_cycle_s]
     neighbours = Neighbours(others, scenario.formation.slack_s)
     conflicting: list[tuple[float, Plan]] = []
     """Plans that end in time, and how long their conflicts last."""
 
     def min_slot_s() -> float:
-        """Return to which length slots may be shortened to avoid the conflicts found so far."""
+        """Return the shortest slots that may be tried, which depend on the conflicts so far."""
         if not conflicting:
             return 0.0
         is_short = min(conflict_s for conflict_s, _ in conflicting) <= SHORT_CONFLICT_S
@@ -150,7 +150,7 @@ class Neighbours:
     """Moves of neighbouring formations with which those of a new plan may have conflicts."""
 
     def __init__(self, plans: Iterable[Plan], slack_s: float) -> None:
-        """Collect the moves by a column, by their first column.
+        """Collect the moves that change the column.
 
         Args:
             plans: plans of the neighbouring formations; not changed.
@@ -158,7 +158,7 @@ class Neighbours:
         """
         self._slack_s = slack_s
         self._moves: dict[int, list[tuple[float, float, Move]]] = {}
-        """Begin and end (road time) of moves, and their cells."""
+        """By first column: begin and end of each move (road time), and its cells."""
         for plan in plans:
             for step, move in _moves_by_column(plan):
                 begin_s = plan.t0_s + step * plan.slot_s
@@ -182,7 +182,7 @@ class Neighbours:
         return found
 
     def with_pauses(self, plan: Plan, in_time: Callable[[Plan], bool]) -> Plan:
-        """Return a plan with pauses, so that no move has a `closing` conflict.
+        """Insert pauses into a plan until no move has a `closing` conflict.
 
         All vehicles pause together, so the order of moves does not change. Conflicts remain if a
         plan with a further pause would not end in time.

@@ -15,13 +15,13 @@ from laneweave.protocol.scenario.vehicle_tables import PEAK_ACCEL, Vehicle
 SHORTEST_CYCLE_S, LONGEST_CYCLE_S = 4.0, 7.0
 """Range of T_F if `formation.cycle_s` is not set; the lower end is the paper's value."""
 COMFORTABLE_MPS2, BRISK_MPS2 = 3.0, 3.5
-"""Maximum acceleration of minimum-jerk moves in the comfortable T_F, and in the brisk one."""
+"""Maximum acceleration of minimum-jerk moves: with `comfortable_cycle_s`, with `brisk_cycle_s`."""
 ROLLING_CYCLES_S = ((2000.0, 6.0), (2200.0, 5.4), (math.inf, 5.0))
 """Volumes [vehicles/(lane h)] in ascending order, and T_F [s] of the rolling operation up to each;
 denser traffic needs more steps on the same road (decision 76)."""
 GENTLE_RATIO = 0.9
-"""Maximum acceleration of a minimum-jerk move, divided by the limit, up to which there is a gentle
-move of the same duration (decision 76), if d_F is 12 m or more."""
+"""Maximum ratio between the acceleration of a minimum-jerk move and its limit at which there is a
+gentle move of the same duration (decision 76), if d_F is 12 m or more."""
 MIN_MERGING_SLOTS = 4
 """Number of slots that the rolling operation should have in a lane that begins and ends on the
 road, as that of a ramp; with three, up to 1 % of the vehicles did not change lanes in time at 2000
@@ -101,7 +101,7 @@ class Timing:
 
     @property
     def comfortable_cycle_s(self) -> float:
-        """Shortest T_F [s] with minimum-jerk moves within `COMFORTABLE_MPS2`, or the longest.
+        """Shortest T_F [s] with minimum-jerk moves within `COMFORTABLE_MPS2`; if none, the longest.
 
         Gentle moves (decision 76) may exceed it slightly if d_F is short.
         """
@@ -109,16 +109,16 @@ class Timing:
 
     @property
     def brisk_cycle_s(self) -> float:
-        """The same within `BRISK_MPS2`, but with gentle moves."""
+        """Shortest T_F [s] with gentle moves, and minimum-jerk moves within `BRISK_MPS2`."""
         return max(self._shortest_within(BRISK_MPS2), self.gentle_cycle_s)
 
     @property
     def gentle_cycle_s(self) -> float:
-        """Shortest T_F [s] in which moves by a column are gentle, or the longest."""
+        """Shortest T_F [s] in which moves by a column are gentle; if none, the longest."""
         return self._shortest_within(GENTLE_RATIO * self._cars.max_accel_mps2)
 
     def _shortest_within(self, accel_mps2: float) -> float:
-        """Return the shortest T_F [s] with minimum-jerk moves within a limit, or the longest."""
+        """Return the shortest T_F with minimum-jerk moves within a limit; if none, the longest."""
         min_s = math.sqrt(PEAK_ACCEL * self._formation.gap_m / accel_mps2)
         enough = (one for one in self.slots_s if one >= min_s + self._formation.slack_s)
         return min(enough, default=self.slots_s[-1])

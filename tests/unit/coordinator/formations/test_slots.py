@@ -8,12 +8,7 @@ import pytest
 from msgspec.structs import replace
 
 from laneweave.coordinator.formations import pacing
-from laneweave.coordinator.formations.pacing import (
-    MIN_RESERVE_S,
-    RESERVE_S,
-    Neighbours,
-    steps_of,
-)
+from laneweave.coordinator.formations.pacing import MIN_RESERVE_S, RESERVE_S, Neighbours, steps_of
 from laneweave.coordinator.formations.roster import exit_time_s, start_time_s
 from laneweave.protocol.lattice import Cell, PlannedMove
 from laneweave.protocol.scenario.fields import Scenario
@@ -175,12 +170,8 @@ def test_a_plan_pauses_or_begins_later_or_its_slots_are_shortened(
     [
         (8.9, 4 * 4.4 + MIN_RESERVE_S, 5.8, 0.0),  # two pauses would need too short slots
         (4.0, 2 * 5.4 + MIN_RESERVE_S, 4.6, 1.5),
-        (
-            4.0,
-            2 * 4.6 + 4.0 + MIN_RESERVE_S,
-            5.2,
-            2.5,
-        ),  # a short conflict, slots of 4.6 s would avoid it
+        # Slots of 4.6 s would avoid the conflict, but it is short.
+        (4.0, 2 * 4.6 + 4.0 + MIN_RESERVE_S, 5.2, 2.5),
         (4.0, 2 * 4.4 + MIN_RESERVE_S, 4.0, 1.5),  # there is no time for longer slots at all
     ],
 )
