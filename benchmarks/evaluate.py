@@ -15,8 +15,8 @@ faults     benchmarks/resilience.py, over an hour; only on request
 Finished parts are kept: the same command continues where it stopped. With --labels the sweep runs
 only these methods, and the report replaces only their rows; with --add-runs it keeps those of other
 seeds and volumes, so that the runs of one version may be made on several days. With --budget the
-sweep starts no seed that would not finish in time. The exit status is 1 if a run of formation
-control violates a guarantee or a run does not finish.
+sweep starts no seed that would not finish in time, by the durations of the runs so far. The exit
+status is 1 if a run of formation control violates a guarantee or does not finish.
 """
 
 from __future__ import annotations

@@ -20,6 +20,7 @@ from typing import Any, Final
 
 from attrs import field, frozen
 
+from evaluation.markdown import MISSING, markdown, number
 from experiments import Job, run_points, silence
 from laneweave.launch.run.simulated_run import SimulatedRun
 from laneweave.protocol.config.scenario_files import load_scenario
@@ -34,6 +35,12 @@ VOLUME: Final = 1600
 OPERATIONS: Final = ("formations", "rolling")
 POWER_DBM: Final = 23.0
 """Usual maximum transmission power of vehicle radios."""
+
+
+HEADINGS: Final = (
+    "operation", "sidelink", "dBm", "other senders/km", "runs", "lost by sidelink",
+    "lost by cellular", "time", "in their lanes", "smallest gap", "overlaps",
+)  # fmt: skip
 
 
 @frozen
@@ -119,47 +126,47 @@ def drive(job: Job[Point]) -> dict[str, Any]:
 
 
 def table(record: Path) -> str:
-    """Return the table of docs/RADIO.md."""
+    """Return the table of docs/RADIO.md; runs that are planned but not recorded are `MISSING`."""
     known = json.loads(record.read_text(encoding="utf-8"))
-    headings = (
-        "operation", "sidelink", "dBm", "other senders/km", "runs", "lost by sidelink",
-        "lost by cellular", "time", "in their lanes", "smallest gap", "overlaps",
-    )  # fmt: skip
-    lines = [f"| {' | '.join(headings)} |", "|---" * len(headings) + "|"]
-    for point in POINTS:
-        runs = [
-            known[key] for seed in range(1, point.seeds + 1) if (key := _key(point, seed)) in known
-        ]
-        if point.technology is None or not runs:
-            continue
-        undisturbed = [known[_key(Point(point.operation), run["seed"])] for run in runs]
-        ratios = [
-            run["travel_time_s"] / other["travel_time_s"]
-            for run, other in zip(runs, undisturbed, strict=True)
-            if run["travel_time_s"] is not None
-        ]
-        sidelink = point.technology
-        if "burst_share" in point.settings:
-            share, burst_s = point.settings["burst_share"], point.settings["burst_s"]
-            sidelink += f", bursts of {burst_s:g} s for {100.0 * share:g} % of the time"
-        left = sum(run["left"] for run in runs)
-        in_lanes = left - sum(run["in_another_lane"] for run in runs)
-        stuck = sum(run["demanded"] for run in runs) - left
-        cells = (
-            point.operation,
-            sidelink,
-            f"{point.settings['power_dbm']:g}",
-            f"{point.settings.get('other_senders_per_km', 0.0):g}",
-            f"{len(runs)}",
-            f"{100.0 * fmean(run['sidelink_lost'] for run in runs):.1f} %",
-            f"{100.0 * fmean(run['cellular_lost'] for run in runs):.1f} %",
-            f"{fmean(ratios):.3f}" if ratios else "",
-            f"{100.0 * in_lanes / left:.1f} %" + (f" ({stuck} on the road)" if stuck else ""),
-            f"{min(run['min_gap_m'] for run in runs):.1f} m",
-            f"{sum(run['overlaps'] for run in runs)}",
-        )
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines)
+    rows = [_row(point, known) for point in POINTS if point.technology is not None]
+    return markdown(HEADINGS, rows)
+
+
+def _row(point: Point, known: Mapping[str, dict[str, Any]]) -> list[str]:
+    """Return the row of a point, over its recorded runs."""
+    keys = [_key(point, seed) for seed in range(1, point.seeds + 1)]
+    runs = [known[key] for key in keys if key in known]
+    sidelink = f"{point.technology}"
+    if "burst_share" in point.settings:
+        share, burst_s = point.settings["burst_share"], point.settings["burst_s"]
+        sidelink += f", bursts of {burst_s:g} s for {100.0 * share:g} % of the time"
+    settings = [
+        point.operation,
+        sidelink,
+        f"{point.settings['power_dbm']:g}",
+        f"{point.settings.get('other_senders_per_km', 0.0):g}",
+        f"{len(runs)}" + (f" of {len(keys)}" if len(runs) < len(keys) else ""),
+    ]
+    left = sum(run["left"] for run in runs)
+    if not left:
+        return [*settings, MISSING, *[""] * (len(HEADINGS) - len(settings) - 1)]
+    ratios = [
+        run["travel_time_s"] / other["travel_time_s"]
+        for run in runs
+        if (other := known.get(_key(Point(point.operation), run["seed"]))) is not None
+        and run["travel_time_s"] is not None
+    ]
+    stuck = sum(run["demanded"] for run in runs) - left
+    in_lanes = f"{100.0 * (1.0 - sum(run['in_another_lane'] for run in runs) / left):.1f} %"
+    return [
+        *settings,
+        f"{100.0 * fmean(run['sidelink_lost'] for run in runs):.1f} %",
+        f"{100.0 * fmean(run['cellular_lost'] for run in runs):.1f} %",
+        number(fmean(ratios) if ratios else None, 3),
+        in_lanes + (f" ({stuck} on the road)" if stuck else ""),
+        f"{min(run['min_gap_m'] for run in runs):.1f} m",
+        f"{sum(run['overlaps'] for run in runs)}",
+    ]
 
 
 def _key(point: Point, seed: int) -> str:

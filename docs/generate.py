@@ -843,7 +843,11 @@ def _sensitivity() -> str:
     levels = [("base", study["base"] | {"text": ""})]
     levels += [(one["name"], level) for one in study["factors"] for level in one["levels"]]
     rows = [
-        result_row(name, one["text"], Result(**{key: one[key] for key in fields_dict(Result)}))
+        result_row(
+            name,
+            one["text"],
+            Result(**{key: one[key] for key in fields_dict(Result) if key in one}),
+        )
         for name, one in levels
     ]
     lines = [markdown(HEADINGS, rows)]

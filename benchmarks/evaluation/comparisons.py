@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Final
 
 from evaluation.evidence import Evidence
 from evaluation.intervals import MIN_SEEDS, Difference, Verdict, difference
 from evaluation.markdown import MISSING, NOT_RUN, markdown, number
 from evaluation.points import PointRow
-from evaluation.programme import FORMATIONS, LABELS, TUNED_GOALS, VOLUMES, planned
+from evaluation.programme import FORMATIONS, LABELS, TUNED_FIGURES, VOLUMES, planned
 
 OWN: Final = ("formations", "rolling")
 """Labels that are compared: the two operations with their default settings."""
@@ -39,16 +39,18 @@ def comparison(evidence: Evidence) -> str:
 
 
 def _of_one(evidence: Evidence, label: str) -> str:
-    rows = []
-    sentences = []
+    rows, sentences, without = [], [], []
     for volume in (volume for volume in VOLUMES if planned(label, volume)):
-        found = {
+        cells = {
             other: difference_of(evidence, label, other, volume, "travel_s") for other in OPPONENTS
         }
-        rows.append([f"{volume:g}", *(_cell(found[other], other, volume) for other in OPPONENTS)])
-        words = "; ".join(_words(found))
-        if words:
-            sentences.append(f"- At {volume:g}, `{label}` is {words}.")
+        rows.append([f"{volume:g}", *(_cell(cells[other], other, volume) for other in OPPONENTS)])
+        found = {other: one for other, one in cells.items() if one is not None}
+        if any(one.bounds is not None for one in found.values()):
+            sentences.append(f"- At {volume:g}, `{label}` is {'; '.join(_words(found))}.")
+        elif found:
+            without.append(volume)
+    sentences += _without_intervals(without)
     headings = ["veh/(lane h)", *(f"`{label}` minus `{other}`" for other in OPPONENTS)]
     return "\n\n".join([markdown(headings, rows), "\n".join(sentences) or MISSING])
 
@@ -64,29 +66,26 @@ def tuned_comparison(evidence: Evidence) -> str:
     headings = (
         "veh/(lane h)", "method", "runs", "travel time [s]", "below 3 s to collision [s per run]",
         "minimum time to collision [s]", "vehicles that brake harder than 5 m/s2, per run",
-        "CO2, petrol [g/km]",
+        "CO2, petrol [g/km]", "time beyond comfort",
     )  # fmt: skip
-    sentences, without = [], dict[str, None]()
+    sentences, without = [], dict[float, None]()
     for volume, own, other in itertools.product(TUNED_VOLUMES, OWN, TUNED):
         found = {
-            goal: one
-            for goal in TUNED_GOALS
-            if (one := difference_of(evidence, own, other, volume, goal.figure)) is not None
+            figure: one
+            for figure in TUNED_FIGURES
+            if (one := difference_of(evidence, own, other, volume, figure.field)) is not None
         }
         words = [
-            f"{goal.name} {_COMPARED_WORDS[one.verdict]} ({one.mean:+.2f} {goal.unit}, "
-            f"{one.bounds.low:+.2f} to {one.bounds.high:+.2f})"
-            for goal, one in found.items()
+            f"{figure.name} {_COMPARED_WORDS[one.verdict]} ({one.mean:+.2f} {figure.unit}, "
+            f"{one.bounds.low:+.2f} to {one.bounds.high:+.2f}){_pairs(one)}"
+            for figure, one in found.items()
             if one.bounds is not None
         ]
         if words:
             sentences.append(f"- At {volume:g}, `{own}` against `{other}`: {', '.join(words)}.")
         elif found:
-            without[f"{volume:g}"] = None
-    if without:
-        sentences.append(
-            f"- Without intervals, for which {MIN_SEEDS} seeds are necessary: {', '.join(without)}."
-        )
+            without[volume] = None
+    sentences += _without_intervals(without)
     return "\n\n".join([markdown(headings, rows), "\n".join(sentences) or MISSING])
 
 
@@ -101,6 +100,7 @@ def _figures(row: PointRow) -> list[str]:
         number(row.lowest("min_ttc_s"), 2),
         number(row.mean("hard_brakes"), 1),
         number(row.mean("co2_g_per_km"), 1),
+        f"{number(row.mean('uncomfortable_percent'), 1)} %",
     ]
 
 
@@ -109,7 +109,7 @@ def difference_of(
 ) -> Difference | None:
     """Return the difference of a figure between two methods at a volume, paired by seed.
 
-    None: a method has no complete run there, or they have no seed in common.
+    None: there is no seed with which both methods have a complete run there.
 
     Args:
         evidence: the runs.
@@ -122,28 +122,35 @@ def difference_of(
     return difference(*found)
 
 
-def _by_seed(evidence: Evidence, label: str, volume: float, figure: str) -> Mapping[int, float]:
+def _by_seed(
+    evidence: Evidence, label: str, volume: float, figure: str
+) -> Mapping[int, float | None]:
     row = evidence.by_key.get((label, volume))
-    runs = () if row is None else row.complete
-    values = {run.seed: getattr(run, figure) for run in runs}
-    return {seed: value for seed, value in values.items() if value is not None}
+    runs = () if row is None else row.runs
+    return {run.seed: getattr(run, figure) if run.complete else None for run in runs}
 
 
 def _cell(found: Difference | None, other: str, volume: float) -> str:
     if found is None:
         return MISSING if planned(other, volume) else NOT_RUN
-    if found.bounds is None:
-        return f"{found.mean:+.2f}"
-    return f"{found.mean:+.2f} [{found.bounds.low:+.2f}, {found.bounds.high:+.2f}]"
+    known = "" if found.bounds is None else f" [{found.bounds.low:+.2f}, {found.bounds.high:+.2f}]"
+    return f"{found.mean:+.2f}{known}{_pairs(found)}"
 
 
-def _words(found: Mapping[str, Difference | None]) -> Iterator[str]:
+def _pairs(found: Difference) -> str:
+    """Return how many seeds have both values, if there are others."""
+    return f" ({found.seeds} of {found.seeds + found.without} seeds)" if found.without else ""
+
+
+def _without_intervals(volumes: Iterable[float]) -> Iterator[str]:
+    """Yield a sentence about volumes at which no difference has an interval, if there are any."""
+    if names := ", ".join(f"{volume:g}" for volume in volumes):
+        yield f"- Without intervals, for which {MIN_SEEDS} seeds are necessary: {names}."
+
+
+def _words(found: Mapping[str, Difference]) -> Iterator[str]:
     """Yield the opponents with each verdict."""
     for verdict, words in WORDS.items():
-        names = [
-            f"`{other}`"
-            for other, one in found.items()
-            if one is not None and one.verdict is verdict
-        ]
+        names = [f"`{other}`" for other, one in found.items() if one.verdict is verdict]
         if names:
             yield f"{words} {', '.join(names)}"

@@ -9,6 +9,7 @@ from collections.abc import Collection, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
+from statistics import fmean
 
 from attrs import frozen
 
@@ -56,7 +57,8 @@ class Rounds:
     jobs: int
     """Number of parallel processes."""
     end_s: float | None
-    """Latest expected end of a round (`time.monotonic`), except the first one; None: no limit."""
+    """Latest expected end of a round (`time.monotonic`); None: no limit. Before the first run of a
+    method at a volume nothing is known about its duration."""
 
     def run(self, out: Path) -> bool:
         """Run the unfinished rounds; return whether formation control kept its guarantees.
@@ -66,22 +68,25 @@ class Rounds:
             CommandFailedError: files or processes cannot be created.
         """
         base = load_scenario(None, demand__duration_s=self.duration_s)
-        last_s, kept = 0.0, True
+        kept = True
         with SweepFolder(out / SWEEP_FOLDER) as folder:
             folder.check_settings(base)
             for seed in self.seeds:
-                points = [point for point in points_of(base, seed) if self._includes(point)]
-                if all(folder.is_finished(point) for point in points):
+                points = [
+                    point
+                    for point in points_of(base, seed)
+                    if self._includes(point) and not _has_run(folder, point)
+                ]
+                if not points:
                     continue
-                began_s = time.monotonic()
-                if self.end_s is not None and last_s and began_s + last_s > self.end_s:
+                expected_s = _expected_s(folder, points) / self.jobs
+                if self.end_s is not None and time.monotonic() + expected_s > self.end_s:
                     say(
                         f"no time for seed {seed} and later ones; the next call continues with them"
                     )
                     break
                 say(f"sweep, seed {seed}")
                 run_sweep(points, folder, partial(run_locally, workers=self.jobs), show=True)
-                last_s = time.monotonic() - began_s
                 kept &= not any(
                     folder.runs[point.name].reason for point in points if point.label in FORMATIONS
                 )
@@ -89,6 +94,29 @@ class Rounds:
 
     def _includes(self, point: Point) -> bool:
         return point.label in self.labels and point.volume_veh_per_lane_h in self.volumes
+
+
+def _has_run(folder: SweepFolder, point: Point) -> bool:
+    """Return whether a point need not run again.
+
+    A reference method that jams is a result: it would jam again.
+    """
+    run = folder.runs.get(point.name)
+    jammed = run is not None and run.summary is not None and point.label not in FORMATIONS
+    return jammed or folder.is_finished(point)
+
+
+def _expected_s(folder: SweepFolder, points: Iterable[Point]) -> float:
+    """Return how long points are likely to take in all: as with other seeds, if there are any."""
+    known: dict[tuple[str, float], list[float]] = {}
+    for run in folder.runs.values():
+        if run.wall_s is not None:
+            known.setdefault((run.label, run.volume_veh_per_lane_h), []).append(run.wall_s)
+    return sum(
+        fmean(times_s)
+        for point in points
+        if (times_s := known.get((point.label, point.volume_veh_per_lane_h)))
+    )
 
 
 def run_trials(part: str, out: Path, root: Path, jobs: int) -> bool:

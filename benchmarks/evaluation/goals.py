@@ -17,9 +17,9 @@ from evaluation.programme import (
     MAX_COST_RATIO,
     MIN_FACTORS,
     SEEDS,
-    TUNED_GOALS,
+    TUNED_FIGURES,
     Goal,
-    TunedGoal,
+    TunedFigure,
     planned,
 )
 
@@ -61,6 +61,7 @@ def meets(row: PointRow, goal: Goal) -> bool:
     """Return whether a point meets a goal for its label and volume."""
     travel_s, demanded = row.mean("travel_s"), row.total("demanded")
     kept = [
+        not row.unfinished,
         travel_s is not None and travel_s <= goal.travel_s,
         100.0 * row.total("on_preferred_lane") >= goal.on_lane_percent * demanded > 0.0,
     ]
@@ -86,7 +87,9 @@ def _measured(row: PointRow, goal: Goal) -> str:
         parts.append(f"{number(low, 2)} to {number(high, 2)} m/s2")
     if goal.fallback_percent is not None:
         parts.append(f"{row.total('fallbacks')} of {row.total('plans'):,} plans")
-    few = "" if len(row.seeds) >= len(SEEDS) else f" ({len(row.seeds)} of {len(SEEDS)} seeds)"
+    if row.unfinished:
+        parts.append(f"{row.unfinished} runs not finished")
+    few = "" if len(row.runs) >= len(SEEDS) else f" ({len(row.runs)} of {len(SEEDS)} seeds)"
     return ", ".join(parts) + few
 
 
@@ -97,9 +100,10 @@ def _against_tuned(evidence: Evidence, label: str) -> Iterator[tuple[str, ...]]:
     rows = [evidence.by_key.get((label, volume)) for volume in volumes]
     yield f"{name}below 3 s to collision", *_never("ttc_below_3_s", rows)
     yield f"{name}vehicles that brake harder than 5 m/s2", *_never("hard_brakes", rows)
-    for goal in TUNED_GOALS:
-        found = _against(evidence, label, goal)
-        yield f"{name}{goal.name} against tuned drivers", goal.requirement, *found
+    for figure in TUNED_FIGURES:
+        if figure.max_percent is not None:
+            found = _against(evidence, label, figure, figure.max_percent)
+            yield f"{name}{figure.name} against tuned drivers", figure.requirement, *found
 
 
 def _never(figure: str, rows: Sequence[PointRow | None]) -> tuple[str, str, str]:
@@ -115,23 +119,25 @@ def _never(figure: str, rows: Sequence[PointRow | None]) -> tuple[str, str, str]
     return "never", f"in {happened} of {len(values)} runs", _verdict(not happened)
 
 
-def _against(evidence: Evidence, label: str, goal: TunedGoal) -> tuple[str, str]:
+def _against(
+    evidence: Evidence, label: str, figure: TunedFigure, max_percent: float
+) -> tuple[str, str]:
     """Return measured value and verdict of a comparison with all tuned drivers.
 
-    Where all runs of a driver failed, it is named instead of compared.
+    Drivers with unfinished runs are named; where no run has finished, they are not compared.
     """
     found: dict[tuple[str, float], Difference] = {}
     failed = []
     for volume, other in itertools.product(TUNED_VOLUMES, TUNED):
         if not (planned(label, volume) and planned(other, volume)):
             continue
-        one = difference_of(evidence, label, other, volume, goal.figure)
+        one = difference_of(evidence, label, other, volume, figure.field)
         row = evidence.by_key.get((other, volume))
+        if row is not None and row.unfinished:
+            failed.append(f"{row.unfinished} of {len(row.runs)} of `{other}` at {volume:g}")
         if one is not None:
             found[other, volume] = one
-        elif row is not None and row.runs and not row.complete:
-            failed.append(f"`{other}` at {volume:g}")
-        else:
+        elif row is None or row.complete:
             return MISSING, ""
     if not found:
         return MISSING, ""
@@ -140,8 +146,8 @@ def _against(evidence: Evidence, label: str, goal: TunedGoal) -> tuple[str, str]
     low, high, seeds = min(percent.values()), max(percent.values()), _seeds(found.values())
     text = f"{low:+z.2f} to {high:+z.2f} % (highest: `{worst}` at {volume:g}), {seeds}"
     if failed:
-        text += f"; failed: {', '.join(failed)}"
-    return text, _verdict(high <= goal.max_percent)
+        text += f"; runs not finished: {', '.join(failed)}"
+    return text, _verdict(high <= max_percent)
 
 
 def _seeds(differences: Collection[Difference]) -> str:
@@ -153,11 +159,17 @@ def _seeds(differences: Collection[Difference]) -> str:
 
 def _safety(evidence: Evidence) -> Iterator[tuple[str, ...]]:
     """Yield the guarantees of all runs of formation control."""
-    rows = [row for row in evidence.points if row.label in FORMATIONS and row.seeds]
-    runs = f"{sum(len(row.seeds) for row in rows)} runs of formation control"
+    rows = [row for row in evidence.points if row.label in FORMATIONS]
+    count = sum(len(row.runs) for row in rows)
     yield _row(
-        "overlaps", "none", f"{sum(row.total('overlaps') for row in rows)} in {runs}",
-        [not row.total("overlaps") for row in rows],
+        "overlaps", "none",
+        f"{sum(row.overlaps for row in rows)} in {count} runs of formation control",
+        [not row.overlaps for row in rows],
+    )  # fmt: skip
+    unfinished = sum(row.unfinished for row in rows)
+    yield _row(
+        "runs of formation control in which all vehicles leave", "all",
+        f"{count - unfinished} of {count}", [not row.unfinished for row in rows],
     )  # fmt: skip
     low = min((one for row in rows for one in row.values("min_accel_mps2")), default=None)
     high = max((one for row in rows for one in row.values("max_accel_mps2")), default=None)

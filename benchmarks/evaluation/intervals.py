@@ -11,7 +11,8 @@ from attrs import frozen
 from scipy.stats import bootstrap
 
 MIN_SEEDS: Final = 10
-"""Fewer values give no interval: with five, bootstrap intervals contain only 82 % of the means."""
+"""Fewer values give no interval. With normally distributed values, 85 % of 1,000 intervals of five
+values contained the mean, 90 % of those of ten, and 93 % of those of twenty."""
 CONFIDENCE: Final = 0.95
 _RESAMPLES: Final = 9999
 _EQUAL: Final = 1e-12
@@ -67,6 +68,8 @@ class Difference:
     """The mean difference, relative to the mean of the other method over these seeds [%]."""
     seeds: int
     """Number of these seeds."""
+    without: int = 0
+    """Number of further seeds of both methods for which a run did not finish, or has no value."""
 
     @property
     def verdict(self) -> Verdict:
@@ -78,17 +81,24 @@ class Difference:
         return Verdict.MORE if self.bounds.low > 0.0 else Verdict.NONE
 
 
-def difference(own: Mapping[int, float], other: Mapping[int, float]) -> Difference | None:
-    """Return the difference of two methods, paired by seed; None: they have no seed in common.
+def difference(
+    own: Mapping[int, float | None], other: Mapping[int, float | None]
+) -> Difference | None:
+    """Return the difference of two methods, paired by seed; None: no seed has both values.
 
     Args:
-        own: value by seed.
-        other: value of the other method by seed.
+        own: value by seed; None: the run did not finish, or has no value.
+        other: the same of the other method.
     """
-    seeds = sorted(own.keys() & other.keys())
-    if not seeds:
+    pairs = [
+        (value, others)
+        for seed in sorted(own.keys() & other.keys())
+        if (value := own[seed]) is not None and (others := other[seed]) is not None
+    ]
+    if not pairs:
         return None
-    pairs = [own[seed] - other[seed] for seed in seeds]
-    mean = float(np.mean(pairs))
-    percent = 100.0 * mean / float(np.mean([other[seed] for seed in seeds]))
-    return Difference(mean, interval(pairs), percent, len(seeds))
+    differences = [value - others for value, others in pairs]
+    mean = float(np.mean(differences))
+    percent = 100.0 * mean / float(np.mean([others for _, others in pairs]))
+    without = len(own.keys() & other.keys()) - len(pairs)
+    return Difference(mean, interval(differences), percent, len(pairs), without)

@@ -86,7 +86,7 @@ _FIGURES: Final = (
             "Box plots of travel times at the paper's volumes",
             "Travel times at the paper's volumes: formations of at most six vehicles, with the "
             "default and with the paper's settings, and two interpretations of the paper's rules. "
-            "Boxes: quartiles over the vehicles of the seeds that were run last; whiskers: at most "
+            "Boxes: quartiles over the vehicles of all runs without overlaps; whiskers: at most "
             "1.5 interquartile ranges; small dots: vehicles beyond them; large markers and lines: "
             "means. The axis is broken where a method congests.",
         ),
@@ -98,10 +98,11 @@ _FIGURES: Final = (
         Picture(
             "evaluation-all.png",
             "Box plots of travel times at all volumes",
-            "Travel times of four methods, each up to its highest volume. Volumes have places of "
-            "equal width.",
+            "Travel times of four methods, each up to its highest volume: both operations, the "
+            "paper's rules in the interpretation that carries most, and SUMO's best-tuned drivers. "
+            "Volumes have places of equal width.",
         ),
-        ("formations", "paper-12", "rolling", "lc2013"),
+        ("formations", "rolling", "rule-yielding", "lc2013-tuned"),
         VOLUMES,
         draw_travel_times,
     ),
@@ -121,9 +122,9 @@ _FIGURES: Final = (
         Picture(
             "evaluation-speeds.png",
             "Heat maps of mean speed over time and position",
-            "Mean speed in bins of 20 m and 5 s, seed 1. White: v_F; red: slower; blue: faster; "
-            "grey: no vehicle; on each side a square root of the difference. Dashed: start of "
-            "lane sorting.",
+            "Mean speed in bins of 20 m and 5 s, in one run each. White: v_F; red: slower; blue: "
+            "faster; grey: no vehicle; on each side a square root of the difference. Dashed: start "
+            "of lane sorting.",
         ),
         ("formations", "paper-6", "rule", "rule-net"),
         PAPER_VOLUMES[1:],
@@ -138,7 +139,8 @@ _FIGURES: Final = (
         Picture(
             "evaluation-spacing.png",
             "Distributions of spacing and time headway at 1600",
-            "Spacing and time headway at 1600 veh/(lane h), front bumper to front bumper. "
+            "Spacing and time headway at 1600 veh/(lane h), front bumper to front bumper, one run "
+            "each. "
             "Thin grey dashed lines: d_F, and the time that it takes at v_F.",
         ),
         ("formations", "rolling", "rule", "lc2013"),

@@ -48,7 +48,7 @@ class Traced:
     slow_m: tuple[float, float] | None
     """Start and end of the congested stretch of road; None: there is none."""
     slowest_mps: float | None
-    """Lowest mean speed of a bin of the road; None: there were no vehicles."""
+    """Lowest mean speed of a bin of the road behind S1; None: there were no vehicles."""
 
 
 @frozen
@@ -74,7 +74,7 @@ class RunRow:
     reason: str
     """Why the run failed; empty: it did not."""
     complete: bool
-    """Whether all vehicles have left; other runs are in no figure."""
+    """Whether all vehicles have left; of other runs, only the overlaps are known."""
     demanded: int = 0
     left: int = 0
     on_preferred_lane: int = 0
@@ -132,9 +132,14 @@ class PointRow:
         return tuple(run.seed for run in self.complete)
 
     @property
-    def failed(self) -> tuple[RunRow, ...]:
-        """The failed runs."""
-        return tuple(run for run in self.runs if run.reason)
+    def unfinished(self) -> int:
+        """Number of runs that are not complete."""
+        return len(self.runs) - len(self.complete)
+
+    @property
+    def overlaps(self) -> int:
+        """Pairs of bodies that overlapped, in all runs."""
+        return sum(run.overlaps for run in self.runs)
 
     def values(self, name: str) -> list[float]:
         """Return the known values of a figure, run by run."""
@@ -262,7 +267,8 @@ def _row(run: Run) -> RunRow:
     label, volume, seed = run.label, run.volume_veh_per_lane_h, run.scenario.seed
     found = run.summary
     if found is None or found.ending != Ending.COMPLETE.value:
-        return RunRow(label, volume, seed, run.reason, complete=False)
+        overlaps = 0 if found is None else found.safety.overlaps
+        return RunRow(label, volume, seed, run.reason, complete=False, overlaps=overlaps)
     vehicles, safety, planning = found.vehicles, found.safety, found.planning
     energy = (found.energy or {}).get(CO2_OF)
     low, high = safety.min_accel_mps2, safety.max_accel_mps2
@@ -358,9 +364,10 @@ def trace(tracks: Tracks, scenario: Scenario) -> Traced:
 def slow_stretch(
     tracks: Tracks, scenario: Scenario
 ) -> tuple[tuple[float, float] | None, float | None]:
-    """Return the congested stretch of road (start, end) [m] and the minimum mean speed [m/s].
+    """Return the congested stretch of road (start, end) [m], and the lowest mean speed [m/s].
 
-    Speeds are means over bins of the road, from the end of the warm-up to the last arrival.
+    Speeds are means over bins of the road, from the end of the warm-up to the last arrival. The
+    lowest one is that behind S1, where vehicles have settled.
     """
     steady = (tracks.t_s >= WARM_UP_S) & (tracks.t_s <= scenario.demand.duration_s)
     bins = max(1, round(scenario.road.length_m / SLOW_BIN_M))
@@ -373,4 +380,5 @@ def slow_stretch(
     mean_mps = total[driven] / count[driven]
     slow = driven[mean_mps < SLOW_SHARE * scenario.formation.speed_mps]
     stretch = (float(edges_m[slow[0]]), float(edges_m[slow[-1] + 1])) if len(slow) else None
-    return stretch, round(float(mean_mps.min()), 2)
+    settled = mean_mps[edges_m[driven] >= scenario.road.s1_m]
+    return stretch, round(float(settled.min()), 2) if len(settled) else None

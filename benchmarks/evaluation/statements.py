@@ -10,7 +10,9 @@ from typing import Final
 
 from attrs import frozen
 
+from evaluation.comparisons import difference_of
 from evaluation.evidence import Evidence
+from evaluation.intervals import MIN_SEEDS, Verdict
 from evaluation.markdown import HOLDS, MISSING, markdown, number
 from evaluation.points import PointRow
 from evaluation.programme import SEEDS, VOLUMES, paper_bound, planned
@@ -23,6 +25,8 @@ OWN: Final = "paper-6"
 """Formation control with the paper's settings: at most six vehicles."""
 CLOSED: Final = ("formations", OWN, "paper-12")
 """Labels with closed formations: the default and those of the paper."""
+SUMO: Final = ("lc2013", "lc2013-4s", "lc2013-tuned", "sl2015-tuned")
+"""Labels of SUMO's own lane changing."""
 ALIKE_S: Final = 1.0
 """Maximum difference of the mean travel times of methods that are alike."""
 STABLE: Final = 1.05
@@ -30,7 +34,7 @@ STABLE: Final = 1.05
 CONGESTED: Final = 1.25
 """A method is congested if its mean travel time exceeds this multiple of free flow."""
 UNDISTURBED: Final = 0.9
-"""Speeds are undisturbed if no stretch of road is below this share of v_F on average."""
+"""Speeds are undisturbed if no stretch of road behind S1 is below this share of v_F on average."""
 CARRIED: Final = 0.97
 """Minimum ratio of throughput to volume at which the volume is carried."""
 PAPER_STRETCH_M: Final = (500.0, 800.0)
@@ -126,10 +130,10 @@ class _Judge:
         below = (volume for volume in times if first is None or volume < first)
         return first, max(below, default=None)
 
-    def _rows(self, *labels: str) -> tuple[list[PointRow], list[bool | None]]:
+    def _rows(self, *labels: str) -> tuple[list[PointRow], list[None]]:
         """Return all points of labels, and None for each planned point that is missing."""
         rows = [
-            self._row(label, volume)
+            self.evidence.by_key.get((label, volume))
             for label in labels
             for volume in VOLUMES
             if planned(label, volume)
@@ -172,8 +176,8 @@ class _Judge:
             return Statement(text, MISSING, "")
         slowest = row.traced.slowest_mps
         measured = (
-            f"`{OWN}` at 1600: the mean speed is at least {slowest:.2f} m/s in every 50 m of road; "
-            "vehicles wait for their cells before they enter"
+            f"`{OWN}` at 1600: the mean speed is at least {slowest:.2f} m/s in every 50 m of road "
+            "behind S1"
         )
         return Statement(text, measured, _all([slowest >= UNDISTURBED * setting.speed_mps]))
 
@@ -181,15 +185,20 @@ class _Judge:
         text = "Formation control is faster than the rules at these volumes"
         parts: list[str] = []
         kept: list[bool | None] = []
+        few = False
         for label in INTERPRETATIONS:
-            gains = []
-            for volume in PAPER_VOLUMES:
-                rule_s, own_s = self._travel_s(label, volume), self._travel_s(OWN, volume)
-                gains.append(None if rule_s is None or own_s is None else rule_s - own_s)
-            texts = ["-" if gain is None else f"{gain:+.1f}" for gain in gains]
-            known = [gain for gain in gains if gain is not None]
-            parts.append(f"`{label}` minus `{OWN}` {_series(texts, known)}")
-            kept.append(all(gain > 0.0 for gain in known) if len(known) == len(gains) else None)
+            found = [
+                difference_of(self.evidence, OWN, label, volume, "travel_s")
+                for volume in PAPER_VOLUMES
+            ]
+            known = [one for one in found if one is not None]
+            texts = ["-" if one is None else f"{one.mean:+.1f}" for one in found]
+            parts.append(f"`{OWN}` minus `{label}` {_series(texts, known)}")
+            judged = [one.verdict is Verdict.LESS for one in known if one.bounds is not None]
+            few |= len(judged) < len(known)
+            kept.append(all(judged) if judged and len(judged) == len(found) else None)
+        if few:
+            parts.append(f"volumes with fewer than {MIN_SEEDS} seeds are not judged")
         return Statement(text, "; ".join(parts), _some(kept))
 
     def _alike_below(self) -> Statement:
@@ -197,13 +206,17 @@ class _Judge:
         parts: list[str] = []
         kept: list[bool | None] = []
         for volume in (500.0, 750.0):
-            times = [self._travel_s(label, volume) for label in (OWN, *INTERPRETATIONS)]
-            known = [t_s for t_s in times if t_s is not None]
-            parts.append(f"at {volume:g}: {_series([number(t_s, 1) for t_s in times], known)}")
-            whole = len(known) == len(times)
-            kept.append(max(known) - min(known) <= ALIKE_S if whole else None)
-        whose = ", ".join(f"`{label}`" for label in (OWN, *INTERPRETATIONS))
-        return Statement(text, f"{whose} {'; '.join(parts)}", _all(kept))
+            found = [
+                difference_of(self.evidence, label, OWN, volume, "travel_s")
+                for label in INTERPRETATIONS
+            ]
+            more_s = [one.mean for one in found if one is not None]
+            texts = ["-" if one is None else f"{one.mean:+.1f}" for one in found]
+            alike = len(more_s) == len(found) and max(0.0, *more_s) - min(0.0, *more_s) <= ALIKE_S
+            kept.append(alike if len(more_s) == len(found) else None)
+            parts.append(f"at {volume:g}: {_series(texts, more_s)}" + (", alike" if alike else ""))
+        whose = ", ".join(f"`{label}`" for label in INTERPRETATIONS)
+        return Statement(text, f"{whose} minus `{OWN}` {'; '.join(parts)}", _all(kept))
 
     def _bound(self) -> Statement:
         row, setting = self._row("paper-12", 1750.0), self.evidence.setting
@@ -231,9 +244,10 @@ class _Judge:
         if not rows:
             return Statement(text, MISSING, "")
         off, vehicles = _off(rows)
-        overlaps = sum(row.total("overlaps") for row in rows)
+        overlaps = sum(row.overlaps for row in rows)
         measured = f"{overlaps} overlaps, {off} of {vehicles:,} vehicles not in their lane"
-        return Statement(text, measured, _all([not overlaps and not off, *missing]))
+        kept = not overlaps and not off and not _unfinished(rows)
+        return Statement(text, measured + _unfinished_text(rows), _all([kept, *missing]))
 
     def _rules_complete(self) -> Statement:
         text = "The rules bring all vehicles to their preferred lanes in any traffic"
@@ -241,22 +255,24 @@ class _Judge:
         if not rows:
             return Statement(text, MISSING, "")
         off, vehicles = _off(rows)
-        measured = f"{off} of {vehicles:,} did not reach their lane"
-        return Statement(text, measured, _all([not off, *missing]))
+        measured = f"{off} of {vehicles:,} did not reach their lane{_unfinished_text(rows)}"
+        return Statement(text, measured, _all([not off and not _unfinished(rows), *missing]))
 
     def _sumo_blocks(self) -> Statement:
         text = "SUMO's own lane changing may block itself at the end of the road"
-        rows, missing = self._rows("lc2013")
-        if not rows:
-            return Statement(text, MISSING, "")
-        off, vehicles = _off(rows)
-        last = rows[-1]
-        measured = (
-            f"`lc2013`: {off} of {vehicles:,} did not reach their lane; "
-            f"{number(last.mean('travel_s'), 1)} s at {last.volume_veh_per_lane_h:g}"
-        )
-        verdict = HOLDS if off else "not observed"
-        return Statement(text, measured, _provisional(verdict, missing))
+        parts: list[str] = []
+        blocked: list[bool | None] = []
+        for label in SUMO:
+            rows, missing = self._rows(label)
+            off, vehicles = _off(rows)
+            if rows:
+                blocked.append(off > 0 or _unfinished(rows) > 0)
+            blocked.extend(missing)
+            found = f"{off} of {vehicles:,} did not reach their lane{_unfinished_text(rows)}"
+            parts.append(f"`{label}`: {found if rows else MISSING}")
+        known = [one for one in blocked if one is not None]
+        verdict = HOLDS if any(known) else "not observed"
+        return Statement(text, "; ".join(parts), _provisional(verdict, blocked) if known else "")
 
     def _six(self) -> Statement:
         text = "Formations have at most six vehicles, for computational reasons"
@@ -274,6 +290,19 @@ def _off(rows: Sequence[PointRow]) -> tuple[int, int]:
     return demanded - sum(row.total("on_preferred_lane") for row in rows), demanded
 
 
+def _unfinished(rows: Sequence[PointRow]) -> int:
+    """Return the number of runs that did not finish."""
+    return sum(row.unfinished for row in rows)
+
+
+def _unfinished_text(rows: Sequence[PointRow]) -> str:
+    """Return as text at which volumes runs did not finish; empty if all did."""
+    volumes = [f"{row.volume_veh_per_lane_h:g}" for row in rows if row.unfinished]
+    if not volumes:
+        return ""
+    return f", and {_unfinished(rows)} runs did not finish (at {', '.join(volumes)})"
+
+
 def _onset(first: float | None, below: float | None) -> str:
     """Return as text the lowest congested volume, and the highest measured one below it."""
     if first is None:
@@ -281,7 +310,7 @@ def _onset(first: float | None, below: float | None) -> str:
     return f"at {first:g}" + ("" if below is None else f", not yet at {below:g}")
 
 
-def _series(texts: Sequence[str], known: Sequence[float]) -> str:
+def _series(texts: Sequence[str], known: Sequence[object]) -> str:
     """Return numbers at the paper's volumes as text, or `MISSING`."""
     return f"{', '.join(texts)} s" if known else MISSING
 

@@ -61,15 +61,21 @@ def _cell(label: str, volume: float, row: PointRow | None, text: Callable[[Point
     if row is None:
         return MISSING if planned(label, volume) else NOT_RUN
     if text is not _runs and not row.seeds:
-        return "failed"
+        return "not finished"
     return text(row)
 
 
 def _runs(row: PointRow) -> str:
-    count = f"{len(row.seeds)}"
-    if len(row.seeds) < len(SEEDS):
+    count = f"{len(row.runs)}"
+    if len(row.runs) < len(SEEDS):
         count += f" of {len(SEEDS)}"
-    return count + (f", {len(row.failed)} failed" if row.failed else "")
+    with_overlaps = sum(run.complete and run.overlaps > 0 for run in row.runs)
+    parts = [count]
+    if row.unfinished:
+        parts.append(f"{row.unfinished} not finished")
+    if with_overlaps:
+        parts.append(f"{with_overlaps} with overlaps")
+    return ", ".join(parts)
 
 
 def _travel_time(row: PointRow) -> str:
@@ -91,8 +97,7 @@ def _margins(row: PointRow) -> str:
         number(row.lowest("min_accel_mps2"), 1),
     )
     text = " / ".join(figures)
-    overlaps = row.total("overlaps")
-    return text + (f", **{overlaps} overlaps**" if overlaps else "")
+    return text + (f", **{row.overlaps} overlaps**" if row.overlaps else "")
 
 
 def _brakes(row: PointRow) -> str:
@@ -108,12 +113,21 @@ def _safety(row: PointRow) -> str:
     exposed_s = sum(run.ttc_below_3_s or 0.0 for run in runs) / left
     hard = 100.0 * sum(run.hard_brakes or 0 for run in runs) / left
     closest = (number(row.lowest("min_ttc_s"), 2), f"{exposed_s:.3f}")
-    return " / ".join((*closest, number(row.lowest("min_pet_s"), 2), f"{hard:.1f} %"))
+    text = " / ".join((*closest, number(row.lowest("min_pet_s"), 2), f"{hard:.1f} %"))
+    return text + _of_runs(row, "ttc_below_3_s")
 
 
 def _comfort(row: PointRow) -> str:
     share, co2 = row.mean("uncomfortable_percent"), row.mean("co2_g_per_km")
-    return NOT_RUN if share is None else f"{number(share, 1)} % / {number(co2, 1)}"
+    if share is None:
+        return NOT_RUN
+    return f"{number(share, 1)} % / {number(co2, 1)}{_of_runs(row, 'co2_g_per_km')}"
+
+
+def _of_runs(row: PointRow, figure: str) -> str:
+    """Return how many of the runs have a figure, if not all have it."""
+    known, count = len(row.values(figure)), len(row.complete)
+    return f" ({known} of {count} runs)" if known < count else ""
 
 
 def _throughput(row: PointRow) -> str:

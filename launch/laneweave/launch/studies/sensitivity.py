@@ -14,6 +14,7 @@ from laneweave.launch.sweep.points import checked_settings
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.radio_table import C_V2X, Radio
+from laneweave.protocol.summary import Ending
 
 BASE: Final = "base"
 _ERRORS: Final = (
@@ -159,7 +160,8 @@ class Result:
 
     runs: int
     delay_s: float | None
-    """Mean travel time, less the time that the length of the road takes at v_F."""
+    """Mean travel time, less the time that the length of the road takes at v_F; only of runs in
+    which all vehicles have left."""
     delays_s: tuple[float, ...]
     """The same of each run."""
     arrived_percent: float | None
@@ -171,24 +173,27 @@ class Result:
     overlaps: int
     not_left: int
     """Number of vehicles that have not left the road."""
+    failed: int = 0
+    """Number of runs that failed; those without a summary are in no other figure."""
 
 
 def result_of(runs: Sequence[Run]) -> Result:
     """Return the results of runs that differ in their seeds only."""
-    found = [(run, run.summary) for run in runs if run.summary is not None]
     delays_s = [
         mean_s - run.scenario.road.length_m / run.scenario.formation.speed_mps
-        for run, summary in found
-        if (mean_s := summary.travel_time_s.mean) is not None
+        for run in runs
+        if run.summary is not None
+        and run.summary.ending == Ending.COMPLETE.value
+        and (mean_s := run.summary.travel_time_s.mean) is not None
     ]
-    summaries = [summary for _, summary in found]
+    summaries = [run.summary for run in runs if run.summary is not None]
     petrol = [
         one.energy["petrol"].co2_g_per_km
         for one in summaries
         if one.energy is not None and "petrol" in one.energy
     ]
     return Result(
-        runs=len(found),
+        runs=len(runs),
         delay_s=_mean(delays_s),
         delays_s=tuple(delays_s),
         arrived_percent=_mean(
@@ -199,6 +204,7 @@ def result_of(runs: Sequence[Run]) -> Result:
         co2_g_per_km=_mean(petrol),
         overlaps=sum(one.safety.overlaps for one in summaries),
         not_left=sum(one.vehicles.demanded - one.vehicles.left for one in summaries),
+        failed=sum(bool(run.reason) for run in runs),
     )
 
 

@@ -82,7 +82,7 @@ def result_row(name: str, text: str, result: Result) -> tuple[str, ...]:
         _shown(result.co2_g_per_km, 1),
         f"{result.overlaps}",
         f"{result.not_left}",
-        f"{result.runs}",
+        f"{result.runs}, {result.failed} failed" if result.failed else f"{result.runs}",
     )
 
 

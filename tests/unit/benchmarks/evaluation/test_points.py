@@ -57,7 +57,7 @@ def test_means_extremes_and_sums_over_seeds() -> None:
         ]
     )
     assert row.seeds == (1, 2)
-    assert [(one.seed, one.reason) for one in row.failed] == [(2, "2 pairs of vehicles overlapped")]
+    assert (row.overlaps, row.unfinished) == (2, 0)
     assert (row.mean("travel_s"), row.mean("travel_p95_s")) == (71.0, 72.0)
     assert (row.total("left"), row.total("on_preferred_lane")) == (200, 199)
     assert row.on_lane_percent == 99.5
@@ -68,8 +68,8 @@ def test_means_extremes_and_sums_over_seeds() -> None:
     assert row.traced is None
 
 
-def test_runs_that_were_cut_off_are_in_no_figure() -> None:
-    cut = summary(500.0, ending="limit")
+def test_of_runs_that_were_cut_off_only_overlaps_count() -> None:
+    cut = summary(500.0, ending="limit", safety={"overlaps": 1})
     (row,) = rows_of(
         [
             run("rule", 1600.0, 1, summary(70.0)),
@@ -78,8 +78,8 @@ def test_runs_that_were_cut_off_are_in_no_figure() -> None:
         ]
     )
     assert row.seeds == (1,)
-    assert [one.seed for one in row.failed] == [2, 3]
-    assert (row.values("travel_s"), row.total("demanded")) == ([70.0], 100)
+    assert row.unfinished == 2
+    assert (row.values("travel_s"), row.total("demanded"), row.overlaps) == ([70.0], 100, 1)
 
 
 def test_rows_are_in_the_order_of_labels_and_volumes() -> None:

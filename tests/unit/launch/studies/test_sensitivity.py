@@ -18,9 +18,10 @@ from laneweave.launch.studies.sensitivity import (
     factors_of,
     result_of,
 )
-from laneweave.launch.studies.sensitivity_page import draw_tornado, results_table
+from laneweave.launch.studies.sensitivity_page import draw_tornado, result_row, results_table
 from laneweave.protocol.config.scenario_files import load_scenario, scenario_of
 from laneweave.protocol.scenario.radio_table import C_V2X, DSRC
+from laneweave.protocol.summary import Ending
 from support.commands import Here
 from support.summaries import make_summary
 
@@ -91,19 +92,29 @@ def test_ends_that_are_impossible_are_named() -> None:
 
 
 def test_results_of_runs() -> None:
-    def run_with(mean_s: float | None, ttc_s: float, left: int) -> Run:
+    def run_with(
+        mean_s: float | None, ttc_s: float, left: int, ending: Ending = Ending.COMPLETE
+    ) -> Run:
         made = make_summary()
         summary = evolve(
             made,
+            ending=ending.value,
             travel_time_s=evolve(made.travel_time_s, mean=mean_s),
             safety=evolve(made.safety, min_ttc_s=ttc_s),
             vehicles=evolve(made.vehicles, left=left),
         )
-        return Run(Path("x"), "base", "formation", BASE, summary)
+        reason = "" if ending is Ending.COMPLETE else "not complete"
+        return Run(Path("x"), "base", "formation", BASE, summary, reason)
 
-    runs = [run_with(70.0, 3.1, 100), run_with(72.0, 2.9, 98), Run(Path("x"), "b", "f", BASE, None)]
+    runs = [
+        run_with(70.0, 3.1, 100),
+        run_with(72.0, 2.9, 100),
+        run_with(90.0, 3.3, 98, Ending.LIMIT),
+        Run(Path("x"), "base", "formation", BASE, None, "its process was ended by SIGKILL"),
+    ]
     found = result_of(runs)
-    assert found.runs == 2
+    assert (found.runs, found.failed) == (4, 2)
+    assert result_row("N", "4", found)[-2:] == ("2", "4, 2 failed")
     assert found.delay_s == pytest.approx(71.0 - 1000.0 / 15.0)
     assert found.delays_s == pytest.approx((70.0 - 1000.0 / 15.0, 72.0 - 1000.0 / 15.0))
     assert (found.min_ttc_s, found.not_left, found.co2_g_per_km) == (2.9, 2, None)
