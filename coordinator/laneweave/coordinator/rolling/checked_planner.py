@@ -31,6 +31,10 @@ _MAX_WORK = 600.0
 """Maximum product of this number and n squared, where vehicles may move during n slots.
 
 The time of a path search grows with n squared, so longer roads get fewer annealings."""
+_MODE_2_WORK = 1.7
+"""Time of an annealing in mode 2, with moves to eight cells, relative to mode 1."""
+_FULL_CYCLE_S = 5.0
+"""T_F [s] in which there is time for `_MAX_WORK`; in shorter slots, the maximum is proportional."""
 
 
 Planner = Callable[
@@ -93,13 +97,15 @@ def stream_road(scenario: Scenario) -> StreamRoad:
     advance_m = formation.speed_mps * scenario.timing.cycles_s[0]
     moves_from_m = scenario.geometry.moves_from_m
     slots = (road.length_m - moves_from_m) / advance_m
+    work = max(1.0, slots) ** 2 * (_MODE_2_WORK if mode == 2 else 1.0)
+    max_work = _MAX_WORK * min(1.0, scenario.timing.cycles_s[0] / _FULL_CYCLE_S)
     return StreamRoad(
         around_m=around_m,
         lanes=road.lanes,
         pitch_m=formation.gap_m,
         advance_m=advance_m,
         sorting_m=(moves_from_m, road.length_m),
-        anneals=max(1, min(_MAX_ANNEALS, int(_MAX_WORK / max(1.0, slots) ** 2))),
+        anneals=max(1, min(_MAX_ANNEALS, int(max_work / work))),
         length_m=road.length_m,
         body_m=scenario.types.longest_body_m,
         mode=mode,

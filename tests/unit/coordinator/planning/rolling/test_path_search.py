@@ -26,9 +26,9 @@ from laneweave.coordinator.planning.rolling.problem import (
 )
 from laneweave.coordinator.planning.rolling.rolling_validator import problems_of_plan
 from laneweave.coordinator.rolling.checked_planner import stream_road
+from laneweave.protocol.config.scenario_files import load_scenario
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.road_layout import LaneSection
-from laneweave.protocol.scenario.fields import Scenario
 from support import rolling_oracles as oracle
 from support.examples import examples
 from support.rolling_oracles import ROAD, SHORT, Stream, streams
@@ -536,7 +536,19 @@ def test_the_search_goes_on_while_vehicles_miss_their_lanes() -> None:
     assert 2 * missed[6] < missed[1]
 
 
-@pytest.mark.parametrize(("s3_m", "anneals"), [(1e-3, 6), (600.0, 6), (900.0, 2), (9600.0, 1)])
+@pytest.mark.parametrize(("s3_m", "anneals"), [(1e-3, 6), (600.0, 6), (1500.0, 2), (9600.0, 1)])
 def test_paths_are_annealed_less_often_on_longer_roads(s3_m: float, anneals: int) -> None:
-    road = evolve(Scenario().road, s3_m=s3_m)
-    assert stream_road(evolve(Scenario(), road=road)).anneals == anneals
+    scenario = load_scenario(None, formation__operation="rolling")
+    road = evolve(scenario.road, s3_m=s3_m)
+    assert stream_road(evolve(scenario, road=road)).anneals == anneals
+
+
+@pytest.mark.parametrize(
+    ("cycle_s", "mode", "anneals"),
+    [(6.0, 1, 6), (5.0, 1, 6), (4.0, 1, 4), (6.0, 2, 6), (5.0, 2, 5), (4.0, 2, 2)],
+)
+def test_paths_are_annealed_less_often_in_short_slots_and_with_more_moves(
+    cycle_s: float, mode: int, anneals: int
+) -> None:
+    scenario = load_scenario(None, formation__cycle_s=cycle_s, formation__mode=mode)
+    assert stream_road(scenario).anneals == anneals
