@@ -13,7 +13,7 @@ import json
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from statistics import fmean
 from typing import Any, Final
@@ -147,9 +147,9 @@ def _row(point: Point, known: Mapping[str, dict[str, Any]]) -> list[str]:
         f"{point.settings.get('other_senders_per_km', 0.0):g}",
         f"{len(runs)}" + (f" of {len(keys)}" if len(runs) < len(keys) else ""),
     ]
-    left = sum(run["left"] for run in runs)
-    if not left:
+    if not runs:
         return [*settings, MISSING, *[""] * (len(HEADINGS) - len(settings) - 1)]
+    left = sum(run["left"] for run in runs)
     ratios = [
         run["travel_time_s"] / other["travel_time_s"]
         for run in runs
@@ -157,16 +157,24 @@ def _row(point: Point, known: Mapping[str, dict[str, Any]]) -> list[str]:
         and run["travel_time_s"] is not None
     ]
     stuck = sum(run["demanded"] for run in runs) - left
-    in_lanes = f"{100.0 * (1.0 - sum(run['in_another_lane'] for run in runs) / left):.1f} %"
+    off = sum(run["in_another_lane"] for run in runs)
+    in_lanes = f"{100.0 * (1.0 - off / left):.1f} %" if left else "-"
+    gaps_m = [run["min_gap_m"] for run in runs if run["min_gap_m"] is not None]
     return [
         *settings,
-        f"{100.0 * fmean(run['sidelink_lost'] for run in runs):.1f} %",
-        f"{100.0 * fmean(run['cellular_lost'] for run in runs):.1f} %",
+        _percent([run["sidelink_lost"] for run in runs]),
+        _percent([run["cellular_lost"] for run in runs]),
         number(fmean(ratios) if ratios else None, 3),
         in_lanes + (f" ({stuck} on the road)" if stuck else ""),
-        f"{min(run['min_gap_m'] for run in runs):.1f} m",
+        f"{number(min(gaps_m, default=None), 1)} m",
         f"{sum(run['overlaps'] for run in runs)}",
     ]
+
+
+def _percent(shares: Sequence[float | None]) -> str:
+    """Return the mean of the known shares in percent."""
+    known = [share for share in shares if share is not None]
+    return f"{100.0 * fmean(known):.1f} %" if known else "-"
 
 
 def _key(point: Point, seed: int) -> str:

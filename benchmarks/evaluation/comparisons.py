@@ -66,9 +66,9 @@ def tuned_comparison(evidence: Evidence) -> str:
     headings = (
         "veh/(lane h)", "method", "runs", "travel time [s]", "below 3 s to collision [s per run]",
         "minimum time to collision [s]", "vehicles that brake harder than 5 m/s2, per run",
-        "CO2, petrol [g/km]", "time beyond comfort",
+        "CO2, petrol [g/km]", "time beyond comfort [%]",
     )  # fmt: skip
-    sentences, without = [], dict[float, None]()
+    sentences, compared, judged = [], dict[float, None](), set[float]()
     for volume, own, other in itertools.product(TUNED_VOLUMES, OWN, TUNED):
         found = {
             figure: one
@@ -81,11 +81,12 @@ def tuned_comparison(evidence: Evidence) -> str:
             for figure, one in found.items()
             if one.bounds is not None
         ]
+        if found:
+            compared[volume] = None
         if words:
+            judged.add(volume)
             sentences.append(f"- At {volume:g}, `{own}` against `{other}`: {', '.join(words)}.")
-        elif found:
-            without[volume] = None
-    sentences += _without_intervals(without)
+    sentences += _without_intervals(volume for volume in compared if volume not in judged)
     return "\n\n".join([markdown(headings, rows), "\n".join(sentences) or MISSING])
 
 
@@ -94,13 +95,13 @@ def _figures(row: PointRow) -> list[str]:
     return [
         f"{row.volume_veh_per_lane_h:g}",
         f"`{row.label}`",
-        f"{len(row.seeds)}",
+        f"{len(row.runs)}" + (f", {row.unfinished} not finished" if row.unfinished else ""),
         number(row.mean("travel_s"), 2),
         number(row.mean("ttc_below_3_s"), 1),
         number(row.lowest("min_ttc_s"), 2),
         number(row.mean("hard_brakes"), 1),
         number(row.mean("co2_g_per_km"), 1),
-        f"{number(row.mean('uncomfortable_percent'), 1)} %",
+        number(row.mean("uncomfortable_percent"), 1),
     ]
 
 
@@ -139,7 +140,9 @@ def _cell(found: Difference | None, other: str, volume: float) -> str:
 
 def _pairs(found: Difference) -> str:
     """Return how many seeds have both values, if there are others."""
-    return f" ({found.seeds} of {found.seeds + found.without} seeds)" if found.without else ""
+    if not found.incomplete_pairs:
+        return ""
+    return f" ({found.seeds} of {found.seeds + found.incomplete_pairs} seeds)"
 
 
 def _without_intervals(volumes: Iterable[float]) -> Iterator[str]:

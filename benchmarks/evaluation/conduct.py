@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 import threading
 import time
@@ -15,7 +16,7 @@ from attrs import frozen
 
 from evaluation.evidence import Evidence, read_evidence, setting_of, write_evidence
 from evaluation.pictures import draw_pictures
-from evaluation.points import run_rows
+from evaluation.points import JAMMED, Key, run_rows
 from evaluation.programme import FORMATIONS, points_of
 from evaluation.trials import (
     TRIALS,
@@ -26,13 +27,14 @@ from evaluation.trials import (
     is_finished,
     run_trial,
 )
-from laneweave.launch.recordings.runs import is_sweep, runs_of
+from laneweave.launch.recordings.runs import Run, is_sweep, runs_of
 from laneweave.launch.sweep.execution import StoppedError, run_locally
 from laneweave.launch.sweep.folder import SweepFolder
 from laneweave.launch.sweep.points import Point
 from laneweave.launch.sweep.sweep import run_sweep
 from laneweave.protocol.config.scenario_files import load_scenario
 from laneweave.protocol.errors import BadInputError, CommandFailedError
+from laneweave.protocol.summary import Ending
 
 SWEEP_FOLDER = "sweep"
 PICTURES = "evaluation-*.png"
@@ -57,8 +59,8 @@ class Rounds:
     jobs: int
     """Number of parallel processes."""
     end_s: float | None
-    """Latest expected end of a round (`time.monotonic`); None: no limit. Before the first run of a
-    method at a volume nothing is known about its duration."""
+    """Latest expected end of a round (`time.monotonic`); None: no limit. Nothing is expected of a
+    method at a volume before its first run."""
 
     def run(self, out: Path) -> bool:
         """Run the unfinished rounds; return whether formation control kept its guarantees.
@@ -68,29 +70,32 @@ class Rounds:
             CommandFailedError: files or processes cannot be created.
         """
         base = load_scenario(None, demand__duration_s=self.duration_s)
-        kept = True
         with SweepFolder(out / SWEEP_FOLDER) as folder:
             folder.check_settings(base)
-            for seed in self.seeds:
-                points = [
-                    point
-                    for point in points_of(base, seed)
-                    if self._includes(point) and not _has_run(folder, point)
-                ]
+            planned = {
+                seed: [point for point in points_of(base, seed) if self._includes(point)]
+                for seed in self.seeds
+            }
+            for seed, all_points in planned.items():
+                points = [point for point in all_points if not _has_run(folder, point)]
                 if not points:
                     continue
-                expected_s = _expected_s(folder, points) / self.jobs
-                if self.end_s is not None and time.monotonic() + expected_s > self.end_s:
+                expected_s = _expected_s(folder.runs.values(), points, self.jobs)
+                left_s = math.inf if self.end_s is None else self.end_s - time.monotonic()
+                if expected_s > left_s:
                     say(
-                        f"no time for seed {seed} and later ones; the next call continues with them"
+                        f"seed {seed} is likely to take {expected_s / 60.0:.0f} min, the budget "
+                        f"leaves {max(0.0, left_s) / 60.0:.0f} min; the next call continues with it"
                     )
                     break
                 say(f"sweep, seed {seed}")
                 run_sweep(points, folder, partial(run_locally, workers=self.jobs), show=True)
-                kept &= not any(
-                    folder.runs[point.name].reason for point in points if point.label in FORMATIONS
-                )
-        return kept
+            return not any(
+                run.reason
+                for points in planned.values()
+                for point in points
+                if point.label in FORMATIONS and (run := folder.runs.get(point.name)) is not None
+            )
 
     def _includes(self, point: Point) -> bool:
         return point.label in self.labels and point.volume_veh_per_lane_h in self.volumes
@@ -99,24 +104,37 @@ class Rounds:
 def _has_run(folder: SweepFolder, point: Point) -> bool:
     """Return whether a point need not run again.
 
-    A reference method that jams is a result: it would jam again.
+    A jam or an overlap of a reference method is a result: it would happen again.
     """
     run = folder.runs.get(point.name)
-    jammed = run is not None and run.summary is not None and point.label not in FORMATIONS
-    return jammed or folder.is_finished(point)
+    if run is None or point.label in FORMATIONS:
+        return folder.is_finished(point)
+    return _has_result(run) and (run.has_trajectories or not point.keep_trajectories)
 
 
-def _expected_s(folder: SweepFolder, points: Iterable[Point]) -> float:
-    """Return how long points are likely to take in all: as with other seeds, if there are any."""
-    known: dict[tuple[str, float], list[float]] = {}
-    for run in folder.runs.values():
-        if run.wall_s is not None:
+def _has_result(run: Run) -> bool:
+    """Return whether a run was neither stopped nor crashed."""
+    return run.summary is not None and run.summary.ending in (Ending.COMPLETE.value, *JAMMED)
+
+
+def _expected_s(runs: Iterable[Run], points: Iterable[Point], jobs: int) -> float:
+    """Return how long points are likely to take: as with other seeds, where there are any.
+
+    Args:
+        runs: the runs so far.
+        points: the points.
+        jobs: number of parallel processes.
+    """
+    known: dict[Key, list[float]] = {}
+    for run in runs:
+        if run.wall_s is not None and _has_result(run):
             known.setdefault((run.label, run.volume_veh_per_lane_h), []).append(run.wall_s)
-    return sum(
+    expected_s = [
         fmean(times_s)
         for point in points
         if (times_s := known.get((point.label, point.volume_veh_per_lane_h)))
-    )
+    ]
+    return max(sum(expected_s) / jobs, max(expected_s, default=0.0))
 
 
 def run_trials(part: str, out: Path, root: Path, jobs: int) -> bool:

@@ -9,7 +9,7 @@ from collections.abc import Collection, Iterator, Sequence
 from evaluation.comparisons import OWN, TUNED, TUNED_VOLUMES, difference_of
 from evaluation.evidence import Evidence
 from evaluation.intervals import Difference
-from evaluation.markdown import HOLDS, MISSED, MISSING, markdown, number
+from evaluation.markdown import HOLDS, MISSED, MISSING, counted, markdown, number
 from evaluation.points import PointRow
 from evaluation.programme import (
     FORMATIONS,
@@ -76,6 +76,8 @@ def meets(row: PointRow, goal: Goal) -> bool:
 
 
 def _measured(row: PointRow, goal: Goal) -> str:
+    if not row.complete:
+        return f"none of {counted(len(row.runs), 'run')} finished"
     demanded = row.total("demanded")
     off = demanded - row.total("on_preferred_lane")
     parts = [
@@ -88,7 +90,7 @@ def _measured(row: PointRow, goal: Goal) -> str:
     if goal.fallback_percent is not None:
         parts.append(f"{row.total('fallbacks')} of {row.total('plans'):,} plans")
     if row.unfinished:
-        parts.append(f"{row.unfinished} runs not finished")
+        parts.append(f"{counted(row.unfinished, 'run')} not finished")
     few = "" if len(row.runs) >= len(SEEDS) else f" ({len(row.runs)} of {len(SEEDS)} seeds)"
     return ", ".join(parts) + few
 
@@ -109,7 +111,7 @@ def _against_tuned(evidence: Evidence, label: str) -> Iterator[tuple[str, ...]]:
 def _never(figure: str, rows: Sequence[PointRow | None]) -> tuple[str, str, str]:
     """Return requirement, measured value and verdict for a figure that must be 0 in every run.
 
-    Runs that failed count as runs in which it is not 0.
+    Runs that did not finish count as runs in which it is not 0.
     """
     listed = [row.runs for row in rows if row is not None]
     values = [getattr(run, figure) if run.complete else math.inf for runs in listed for run in runs]
@@ -124,20 +126,25 @@ def _against(
 ) -> tuple[str, str]:
     """Return measured value and verdict of a comparison with all tuned drivers.
 
-    Drivers with unfinished runs are named; where no run has finished, they are not compared.
+    Methods with unfinished runs are named; where no run of a driver has finished, it is not
+    compared. The goal is missed if a run of the operation itself did not finish.
     """
     found: dict[tuple[str, float], Difference] = {}
-    failed = []
+    unfinished: dict[str, None] = {}
+    kept = True
     for volume, other in itertools.product(TUNED_VOLUMES, TUNED):
         if not (planned(label, volume) and planned(other, volume)):
             continue
+        rows = [evidence.by_key.get((name, volume)) for name in (label, other)]
+        for row in rows:
+            if row is not None and row.unfinished:
+                count = f"{row.unfinished} of {len(row.runs)}"
+                unfinished[f"{count} of `{row.label}` at {volume:g}"] = None
+                kept &= row.label != label
         one = difference_of(evidence, label, other, volume, figure.field)
-        row = evidence.by_key.get((other, volume))
-        if row is not None and row.unfinished:
-            failed.append(f"{row.unfinished} of {len(row.runs)} of `{other}` at {volume:g}")
         if one is not None:
             found[other, volume] = one
-        elif row is None or row.complete:
+        elif all(row is None or row.complete for row in rows):
             return MISSING, ""
     if not found:
         return MISSING, ""
@@ -145,26 +152,26 @@ def _against(
     worst, volume = max(percent, key=lambda key: percent[key])
     low, high, seeds = min(percent.values()), max(percent.values()), _seeds(found.values())
     text = f"{low:+z.2f} to {high:+z.2f} % (highest: `{worst}` at {volume:g}), {seeds}"
-    if failed:
-        text += f"; runs not finished: {', '.join(failed)}"
-    return text, _verdict(high <= max_percent)
+    if unfinished:
+        text += f"; runs not finished: {', '.join(unfinished)}"
+    return text, _verdict(kept and high <= max_percent)
 
 
 def _seeds(differences: Collection[Difference]) -> str:
     """Return how many seeds differences are means of."""
     counts = [one.seeds for one in differences]
     few, many = min(counts), max(counts)
-    return f"{few} seeds" if few == many else f"{few} to {many} seeds"
+    return counted(few, "seed") if few == many else f"{few} to {many} seeds"
 
 
 def _safety(evidence: Evidence) -> Iterator[tuple[str, ...]]:
     """Yield the guarantees of all runs of formation control."""
     rows = [row for row in evidence.points if row.label in FORMATIONS]
     count = sum(len(row.runs) for row in rows)
+    known = [run.overlaps for row in rows for run in row.runs if run.overlaps is not None]
     yield _row(
-        "overlaps", "none",
-        f"{sum(row.overlaps for row in rows)} in {count} runs of formation control",
-        [not row.overlaps for row in rows],
+        "overlaps", "none", f"{sum(known)} in {counted(len(known), 'run')} of formation control",
+        [not overlaps for overlaps in known],
     )  # fmt: skip
     unfinished = sum(row.unfinished for row in rows)
     yield _row(
@@ -179,7 +186,7 @@ def _safety(evidence: Evidence) -> Iterator[tuple[str, ...]]:
     )
     yield _row(
         "accelerations", limits, f"{number(low, 2)} to {number(high, 2)} m/s2",
-        [row.within_limits for row in rows],
+        [row.within_limits for row in rows if row.complete],
     )  # fmt: skip
     traced = [row.traced for row in rows if row.traced is not None]
     minimum = [one.lattice_least_m for one in traced if one.lattice_least_m is not None]

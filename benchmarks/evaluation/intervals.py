@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from enum import StrEnum
 from typing import Final, NamedTuple
@@ -64,12 +65,17 @@ class Difference:
 
     mean: float
     bounds: Interval | None
-    percent: float
-    """The mean difference, relative to the mean of the other method over these seeds [%]."""
+    other_mean: float
+    """Mean of the other method over these seeds."""
     seeds: int
     """Number of these seeds."""
-    without: int = 0
+    incomplete_pairs: int = 0
     """Number of further seeds of both methods for which a run did not finish, or has no value."""
+
+    @property
+    def percent(self) -> float:
+        """The mean difference, relative to the mean of the other method [%]; inf: that is 0."""
+        return 100.0 * self.mean / self.other_mean if self.other_mean else math.inf
 
     @property
     def verdict(self) -> Verdict:
@@ -99,6 +105,6 @@ def difference(
         return None
     differences = [value - others for value, others in pairs]
     mean = float(np.mean(differences))
-    percent = 100.0 * mean / float(np.mean([others for _, others in pairs]))
-    without = len(own.keys() & other.keys()) - len(pairs)
-    return Difference(mean, interval(differences), percent, len(pairs), without)
+    other_mean = float(np.mean([others for _, others in pairs]))
+    incomplete = len(own.keys() & other.keys()) - len(pairs)
+    return Difference(mean, interval(differences), other_mean, len(pairs), incomplete)

@@ -21,6 +21,11 @@ def markdown(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     return "\n".join((first, rule, *others))
 
 
+def counted(count: int, noun: str) -> str:
+    """Return a number with its noun, in the plural unless the number is 1."""
+    return f"{count:,} {noun}" if count == 1 else f"{count:,} {noun}s"
+
+
 def number(value: float | None, digits: int) -> str:
     """Return a number as text, or `-` if it is unknown."""
     return "-" if value is None else f"{value:.{digits}f}"

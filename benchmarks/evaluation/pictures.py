@@ -86,7 +86,7 @@ _FIGURES: Final = (
             "Box plots of travel times at the paper's volumes",
             "Travel times at the paper's volumes: formations of at most six vehicles, with the "
             "default and with the paper's settings, and two interpretations of the paper's rules. "
-            "Boxes: quartiles over the vehicles of all runs without overlaps; whiskers: at most "
+            "Boxes: quartiles over the vehicles of the successful runs; whiskers: at most "
             "1.5 interquartile ranges; small dots: vehicles beyond them; large markers and lines: "
             "means. The axis is broken where a method congests.",
         ),

@@ -20,6 +20,8 @@ from laneweave.protocol.summary import Ending
 from laneweave.protocol.wire.events import PLAN_MADE, STREAM_PLANNED
 from laneweave.sim_bridge.recording.trips import WARM_UP_S
 
+JAMMED: Final = (Ending.STANDSTILL.value, Ending.LIMIT.value)
+"""Endings of runs in which vehicles did not leave."""
 SLOW_BIN_M: Final = 50.0
 SLOW_SHARE: Final = 0.5
 """Traffic is congested where its mean speed is below this share of v_F."""
@@ -75,6 +77,8 @@ class RunRow:
     """Why the run failed; empty: it did not."""
     complete: bool
     """Whether all vehicles have left; of other runs, only the overlaps are known."""
+    jammed: bool = False
+    """Whether vehicles stood still or did not leave in time; other incomplete runs have crashed."""
     demanded: int = 0
     left: int = 0
     on_preferred_lane: int = 0
@@ -82,8 +86,8 @@ class RunRow:
     """Mean travel time from the demanded arrival."""
     travel_p95_s: float | None = None
     throughput_veh_per_lane_h: float | None = None
-    overlaps: int = 0
-    """Pairs of bodies."""
+    overlaps: int | None = 0
+    """Pairs of bodies; None: the run has no summary."""
     emergency_brakes: int = 0
     hard_brakes: int | None = None
     """Vehicles."""
@@ -137,9 +141,14 @@ class PointRow:
         return len(self.runs) - len(self.complete)
 
     @property
+    def jammed(self) -> int:
+        """Number of runs that jammed."""
+        return sum(run.jammed for run in self.runs)
+
+    @property
     def overlaps(self) -> int:
-        """Pairs of bodies that overlapped, in all runs."""
-        return sum(run.overlaps for run in self.runs)
+        """Pairs of bodies that overlapped, in all runs with a summary."""
+        return sum(run.overlaps or 0 for run in self.runs)
 
     def values(self, name: str) -> list[float]:
         """Return the known values of a figure, run by run."""
@@ -267,8 +276,15 @@ def _row(run: Run) -> RunRow:
     label, volume, seed = run.label, run.volume_veh_per_lane_h, run.scenario.seed
     found = run.summary
     if found is None or found.ending != Ending.COMPLETE.value:
-        overlaps = 0 if found is None else found.safety.overlaps
-        return RunRow(label, volume, seed, run.reason, complete=False, overlaps=overlaps)
+        return RunRow(
+            label,
+            volume,
+            seed,
+            run.reason,
+            complete=False,
+            jammed=found is not None and found.ending in JAMMED,
+            overlaps=None if found is None else found.safety.overlaps,
+        )
     vehicles, safety, planning = found.vehicles, found.safety, found.planning
     energy = (found.energy or {}).get(CO2_OF)
     low, high = safety.min_accel_mps2, safety.max_accel_mps2

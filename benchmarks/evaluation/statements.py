@@ -5,6 +5,7 @@ The verdict of each statement is computed from the data.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from typing import Final
 
@@ -13,7 +14,7 @@ from attrs import frozen
 from evaluation.comparisons import difference_of
 from evaluation.evidence import Evidence
 from evaluation.intervals import MIN_SEEDS, Verdict
-from evaluation.markdown import HOLDS, MISSING, markdown, number
+from evaluation.markdown import HOLDS, MISSING, counted, markdown, number
 from evaluation.points import PointRow
 from evaluation.programme import SEEDS, VOLUMES, paper_bound, planned
 
@@ -57,7 +58,7 @@ def statements_table(evidence: Evidence) -> str:
     """Return the table of all statements."""
     rows = [(one.text, one.measured, one.verdict) for one in _Judge(evidence).statements()]
     table = markdown(["the paper", "here", ""], rows)
-    few = any(len(row.seeds) < len(SEEDS) for row in evidence.points)
+    few = any(len(row.runs) < len(SEEDS) for row in evidence.points)
     note = f"Not all points have {len(SEEDS)} seeds yet: see the table of runs."
     return f"{table}\n\n{note}" if few else table
 
@@ -86,8 +87,11 @@ class _Judge:
         return row if row is not None and row.seeds else None
 
     def _travel_s(self, label: str, volume: float) -> float | None:
-        row = self._row(label, volume)
-        return None if row is None else row.mean("travel_s")
+        """Return the mean travel time; inf: runs have jammed."""
+        row = self.evidence.by_key.get((label, volume))
+        if row is None:
+            return None
+        return math.inf if row.jammed else row.mean("travel_s")
 
     def _stable(self) -> Statement:
         text = "The travel time of formation control stays stable from 1000 to 1600 veh/(lane h)"
@@ -111,17 +115,22 @@ class _Judge:
         for label in INTERPRETATIONS:
             times = [self._travel_s(label, volume) for volume in PAPER_VOLUMES]
             known = [t_s for t_s in times if t_s is not None]
-            parts.append(f"`{label}` {_series([number(t_s, 1) for t_s in times], known)}")
+            texts = ["jam" if t_s == math.inf else number(t_s, 1) for t_s in times]
+            parts.append(f"`{label}` {_series(texts, known)}")
             kept.append(known == sorted(known) if len(known) == len(times) else None)
         return Statement(text, "; ".join(parts), _all(kept))
 
     def _congested_from(self, label: str) -> tuple[float | None, float | None]:
-        """Return the lowest congested volume, and the highest measured one below it."""
+        """Return the lowest congested volume, and the highest measured one below it.
+
+        A volume at which runs have jammed is congested.
+        """
         setting = self.evidence.setting
         times = {
             row.volume_veh_per_lane_h: travel_s
             for row in self.evidence.points
-            if row.label == label and (travel_s := row.mean("travel_s")) is not None
+            if row.label == label
+            and (travel_s := self._travel_s(label, row.volume_veh_per_lane_h)) is not None
         }
         if setting is None:
             return None, None
@@ -147,7 +156,7 @@ class _Judge:
         for label in (*INTERPRETATIONS, *CLOSED, "lc2013"):
             first, below = self._congested_from(label)
             if label in INTERPRETATIONS:
-                known = self._row(label, 1450.0) is not None
+                known = self._travel_s(label, 1450.0) is not None
                 kept.append(first is not None and first <= 1450.0 if known else None)
             parts.append(f"`{label}` {_onset(first, below)}")
         return Statement(text, "congested: " + "; ".join(parts), _some(kept))
@@ -185,20 +194,19 @@ class _Judge:
         text = "Formation control is faster than the rules at these volumes"
         parts: list[str] = []
         kept: list[bool | None] = []
-        few = False
         for label in INTERPRETATIONS:
             found = [
                 difference_of(self.evidence, OWN, label, volume, "travel_s")
                 for volume in PAPER_VOLUMES
             ]
-            known = [one for one in found if one is not None]
+            verdicts = [one.verdict if one is not None else Verdict.UNKNOWN for one in found]
             texts = ["-" if one is None else f"{one.mean:+.1f}" for one in found]
+            known = [one for one in found if one is not None]
             parts.append(f"`{OWN}` minus `{label}` {_series(texts, known)}")
-            judged = [one.verdict is Verdict.LESS for one in known if one.bounds is not None]
-            few |= len(judged) < len(known)
-            kept.append(all(judged) if judged and len(judged) == len(found) else None)
-        if few:
-            parts.append(f"volumes with fewer than {MIN_SEEDS} seeds are not judged")
+            shown = all(one is Verdict.LESS for one in verdicts)
+            kept.append(False if Verdict.MORE in verdicts else shown or None)
+        if None in kept:
+            parts.append(f"not judged with fewer than {MIN_SEEDS} seeds, or if an interval has 0")
         return Statement(text, "; ".join(parts), _some(kept))
 
     def _alike_below(self) -> Statement:
@@ -213,7 +221,11 @@ class _Judge:
             more_s = [one.mean for one in found if one is not None]
             texts = ["-" if one is None else f"{one.mean:+.1f}" for one in found]
             alike = len(more_s) == len(found) and max(0.0, *more_s) - min(0.0, *more_s) <= ALIKE_S
+            labels = (OWN, *INTERPRETATIONS)
+            alike &= not any(self._travel_s(label, volume) == math.inf for label in labels)
             kept.append(alike if len(more_s) == len(found) else None)
+            if any(one is None or one.bounds is None for one in found):
+                kept.append(None)
             parts.append(f"at {volume:g}: {_series(texts, more_s)}" + (", alike" if alike else ""))
         whose = ", ".join(f"`{label}`" for label in INTERPRETATIONS)
         return Statement(text, f"{whose} minus `{OWN}` {'; '.join(parts)}", _all(kept))
@@ -246,7 +258,7 @@ class _Judge:
         off, vehicles = _off(rows)
         overlaps = sum(row.overlaps for row in rows)
         measured = f"{overlaps} overlaps, {off} of {vehicles:,} vehicles not in their lane"
-        kept = not overlaps and not off and not _unfinished(rows)
+        kept = not overlaps and not off and not any(row.unfinished for row in rows)
         return Statement(text, measured + _unfinished_text(rows), _all([kept, *missing]))
 
     def _rules_complete(self) -> Statement:
@@ -256,7 +268,8 @@ class _Judge:
             return Statement(text, MISSING, "")
         off, vehicles = _off(rows)
         measured = f"{off} of {vehicles:,} did not reach their lane{_unfinished_text(rows)}"
-        return Statement(text, measured, _all([not off and not _unfinished(rows), *missing]))
+        complete = not off and not any(row.unfinished for row in rows)
+        return Statement(text, measured, _all([complete, *missing]))
 
     def _sumo_blocks(self) -> Statement:
         text = "SUMO's own lane changing may block itself at the end of the road"
@@ -266,13 +279,13 @@ class _Judge:
             rows, missing = self._rows(label)
             off, vehicles = _off(rows)
             if rows:
-                blocked.append(off > 0 or _unfinished(rows) > 0)
+                blocked.append(off > 0 or any(row.jammed for row in rows))
             blocked.extend(missing)
             found = f"{off} of {vehicles:,} did not reach their lane{_unfinished_text(rows)}"
             parts.append(f"`{label}`: {found if rows else MISSING}")
         known = [one for one in blocked if one is not None]
-        verdict = HOLDS if any(known) else "not observed"
-        return Statement(text, "; ".join(parts), _provisional(verdict, blocked) if known else "")
+        verdict = HOLDS if any(known) else _provisional("not observed", blocked) if known else ""
+        return Statement(text, "; ".join(parts), verdict)
 
     def _six(self) -> Statement:
         text = "Formations have at most six vehicles, for computational reasons"
@@ -290,17 +303,15 @@ def _off(rows: Sequence[PointRow]) -> tuple[int, int]:
     return demanded - sum(row.total("on_preferred_lane") for row in rows), demanded
 
 
-def _unfinished(rows: Sequence[PointRow]) -> int:
-    """Return the number of runs that did not finish."""
-    return sum(row.unfinished for row in rows)
-
-
 def _unfinished_text(rows: Sequence[PointRow]) -> str:
-    """Return as text at which volumes runs did not finish; empty if all did."""
-    volumes = [f"{row.volume_veh_per_lane_h:g}" for row in rows if row.unfinished]
-    if not volumes:
-        return ""
-    return f", and {_unfinished(rows)} runs did not finish (at {', '.join(volumes)})"
+    """Return as text which runs jammed or crashed; empty if none did."""
+    parts = [
+        f"{counted(count, 'run')} of `{row.label}` at {row.volume_veh_per_lane_h:g} {what}"
+        for row in rows
+        for count, what in ((row.jammed, "jammed"), (row.unfinished - row.jammed, "crashed"))
+        if count
+    ]
+    return "".join(f", {part}" for part in parts)
 
 
 def _onset(first: float | None, below: float | None) -> str:

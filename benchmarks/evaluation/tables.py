@@ -7,7 +7,7 @@ from collections.abc import Callable
 from evaluation.comparisons import comparison, tuned_comparison
 from evaluation.evidence import Evidence
 from evaluation.goals import goals_table
-from evaluation.markdown import MISSING, NOT_RUN, markdown, number
+from evaluation.markdown import MISSING, NOT_RUN, counted, markdown, number
 from evaluation.points import PointRow
 from evaluation.programme import FORMATIONS, LABELS, SEEDS, VOLUMES, planned
 from evaluation.statements import statements_table
@@ -69,7 +69,7 @@ def _runs(row: PointRow) -> str:
     count = f"{len(row.runs)}"
     if len(row.runs) < len(SEEDS):
         count += f" of {len(SEEDS)}"
-    with_overlaps = sum(run.complete and run.overlaps > 0 for run in row.runs)
+    with_overlaps = sum((run.overlaps or 0) > 0 for run in row.runs)
     parts = [count]
     if row.unfinished:
         parts.append(f"{row.unfinished} not finished")
@@ -97,7 +97,7 @@ def _margins(row: PointRow) -> str:
         number(row.lowest("min_accel_mps2"), 1),
     )
     text = " / ".join(figures)
-    return text + (f", **{row.overlaps} overlaps**" if row.overlaps else "")
+    return text + (f", **{counted(row.overlaps, 'overlap')}**" if row.overlaps else "")
 
 
 def _brakes(row: PointRow) -> str:
@@ -127,7 +127,7 @@ def _comfort(row: PointRow) -> str:
 def _of_runs(row: PointRow, figure: str) -> str:
     """Return how many of the runs have a figure, if not all have it."""
     known, count = len(row.values(figure)), len(row.complete)
-    return f" ({known} of {count} runs)" if known < count else ""
+    return f" ({known} of {counted(count, 'run')})" if known < count else ""
 
 
 def _throughput(row: PointRow) -> str:

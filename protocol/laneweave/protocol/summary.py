@@ -54,6 +54,8 @@ class Ending(Enum):
     """The run was stopped, or something failed."""
     LIMIT = "limit"
     """`max_road_s` was reached."""
+    STANDSTILL = "standstill"
+    """With a reference method: all vehicles have stood still for a long time."""
     UNFINISHED = "unfinished"
     """The run goes on, or its process was killed."""
 
@@ -325,6 +327,7 @@ class RunSummary:
     )
     ending: str | None = optional(
         "complete: all demanded vehicles have left; limit: runtime.max_road_s was reached; "
+        "standstill: all vehicles stood still (reference methods); "
         "interrupted: the run was stopped, or something failed; unfinished: the run goes on, or "
         "the process that recorded it was killed"
     )

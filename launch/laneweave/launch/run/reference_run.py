@@ -90,7 +90,8 @@ class ReferenceRun:
                         progress.show(RoadView(clock=road.clock))
                         problem = standstill.problem(road.t_s, traffic.vehicles)
             finally:
-                record.close(road.t_s, road.ending or Ending.INTERRUPTED)
+                stopped = Ending.INTERRUPTED if problem is None else Ending.STANDSTILL
+                record.close(road.t_s, road.ending or stopped)
         return complete_summary(
             self.folder,
             problems=() if problem is None else (problem,),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from statistics import fmean
 from typing import Final
@@ -163,7 +164,7 @@ class Result:
     """Mean travel time, less the time that the length of the road takes at v_F; only of runs in
     which all vehicles have left."""
     delays_s: tuple[float, ...]
-    """The same of each run."""
+    """The same of each of these runs."""
     arrived_percent: float | None
     """Share of the departed vehicles that left in their lane, or at their exit."""
     min_ttc_s: float | None
@@ -217,12 +218,19 @@ def _minimum(values: Iterable[float | None]) -> float | None:
 
 
 def by_effect(factors: Iterable[Factor], results: Mapping[str, Result]) -> list[Factor]:
-    """Return the factors, that with the largest effect on the mean delay first."""
+    """Return the factors, that with the largest effect on the mean delay first.
+
+    The effect of a level with which no run finished is infinite.
+    """
     base_s = results[BASE].delay_s
 
     def effect_s(factor: Factor) -> float:
-        known = [results[one.label].delay_s for one in factor.levels]
-        delays_s = [one for one in (*known, base_s) if one is not None]
+        levels = [results[one.label] for one in factor.levels]
+        if any(one.failed and one.delay_s is None for one in levels):
+            return math.inf
+        delays_s = [
+            one for one in (*(level.delay_s for level in levels), base_s) if one is not None
+        ]
         return max(delays_s, default=0.0) - min(delays_s, default=0.0)
 
     return sorted(factors, key=effect_s, reverse=True)

@@ -25,7 +25,8 @@ def draw_tornado(factors: Sequence[Factor], results: Mapping[str, Result], out: 
     """Draw bars for each factor, from the mean delay of the base to those at its ends.
 
     The ends have a bar each, one above the other, with a line from the smallest to the largest
-    delay of a seed. Without travel times of the base, the chart is empty.
+    delay of a seed. Levels with which no run finished have no bar. Without travel times of the
+    base, the chart is empty.
     """
     base_s = results[BASE].delay_s
     with picture(7.0, 1.5 + 0.42 * len(factors), out, DPI) as figure:
@@ -33,9 +34,11 @@ def draw_tornado(factors: Sequence[Factor], results: Mapping[str, Result], out: 
         rows = range(len(factors))
         for row, factor in zip(reversed(rows), factors, strict=True):
             for level, place, colour in ((factor.low, 0.2, _LOW), (factor.high, -0.2, _HIGH)):
-                delay_s = None if level is None else results[level.label].delay_s
-                if level is None or delay_s is None or base_s is None:
+                if level is None or base_s is None:
                     continue
+                text, delay_s = level.text, results[level.label].delay_s
+                if delay_s is None:
+                    text, delay_s = f"{text}: no run finished", base_s
                 right, delays_s = delay_s >= base_s, results[level.label].delays_s
                 axes.barh(row + place, delay_s - base_s, left=base_s, height=0.36, color=colour)
                 end_s = delay_s
@@ -43,7 +46,7 @@ def draw_tornado(factors: Sequence[Factor], results: Mapping[str, Result], out: 
                     axes.hlines(row + place, min(delays_s), max(delays_s), color="black", lw=0.8)
                     end_s = max(delays_s) if right else min(delays_s)
                 axes.annotate(
-                    level.text,
+                    text,
                     (end_s, row + place),
                     xytext=(3 if right else -3, 0),
                     textcoords="offset points",
@@ -99,7 +102,8 @@ def write_sensitivity(
     refused = [reason for factor in factors for reason in factor.refused]
     caption = (
         "Mean delay with one setting changed at a time; lines: range over the seeds. Delay: mean "
-        "travel time beyond that at v_F, the speed of the lattice; T_F: time of a step; S3: the "
+        "travel time beyond that at v_F, the speed of the lattice, in runs in which all vehicles "
+        "left; T_F: time of a step; S3: the "
         "part of the road in which vehicles change lanes; N: maximum number of vehicles of a "
         "formation."
     )

@@ -78,7 +78,7 @@ def test_of_runs_that_were_cut_off_only_overlaps_count() -> None:
         ]
     )
     assert row.seeds == (1,)
-    assert row.unfinished == 2
+    assert (row.unfinished, row.jammed) == (2, 1)
     assert (row.values("travel_s"), row.total("demanded"), row.overlaps) == ([70.0], 100, 1)
 
 

@@ -161,7 +161,7 @@ def test_a_run_whose_vehicles_stand_forever_has_failed(
         r"\d+ vehicles have stood still since \d+ s of road time", outcome.problems[0]
     )
     found = read_summary(tmp_path)
-    assert found["ending"] == Ending.INTERRUPTED.value
+    assert found["ending"] == Ending.STANDSTILL.value
     assert found["vehicles"]["entered"] > 0
     assert 300.0 <= found["simulated_s"] < 400.0
     assert columns(tmp_path, "trajectories")["vehicle"]

@@ -132,6 +132,8 @@ def test_factors_with_larger_effects_come_first_and_bars_reach_their_ends(tmp_pa
     results = {label: result(delay_s) for label, delay_s in delays_s.items()}
     ordered = by_effect(factors, results)
     assert [one.name for one in ordered] == ["large", "small", "unknown"]
+    jammed = results | {"d": evolve(results["d"], failed=2)}
+    assert [one.name for one in by_effect(factors, jammed)] == ["unknown", "large", "small"]
     draw_tornado(ordered, results, tmp_path / "chart.png")
     assert (tmp_path / "chart.png").read_bytes().startswith(b"\x89PNG")
     table = results_table(ordered, results)
