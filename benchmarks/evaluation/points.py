@@ -50,7 +50,9 @@ class Traced:
     slow_m: tuple[float, float] | None
     """Start and end of the congested stretch of road; None: there is none."""
     slowest_mps: float | None
-    """Lowest mean speed of a bin of the road behind S1; None: there were no vehicles."""
+    """Lowest mean speed of a bin of the road; None: there were no vehicles."""
+    slowest_settled_mps: float | None = None
+    """The same of the road behind the place up to which vehicles settle."""
 
 
 @frozen
@@ -215,6 +217,7 @@ class PointRow:
         offs = [one.lattice_worst_off_m for one in found if one.lattice_worst_off_m is not None]
         slow = [one.slow_m for one in found if one.slow_m is not None]
         speeds = [one.slowest_mps for one in found if one.slowest_mps is not None]
+        settled = [one.slowest_settled_mps for one in found if one.slowest_settled_mps is not None]
         return Traced(
             runs=len(found),
             lattice_least_m=min(spacings, default=None),
@@ -223,6 +226,7 @@ class PointRow:
             lattice_kept=all(one.lattice_kept for one in found),
             slow_m=(min(m for m, _ in slow), max(m for _, m in slow)) if slow else None,
             slowest_mps=min(speeds, default=None),
+            slowest_settled_mps=min(settled, default=None),
         )
 
 
@@ -365,7 +369,7 @@ def trace(tracks: Tracks, scenario: Scenario) -> Traced:
         scenario: scenario of the run.
     """
     spacing = lattice_spacing(tracks, scenario)
-    slow_m, slowest_mps = slow_stretch(tracks, scenario)
+    slow_m, slowest_mps, slowest_settled_mps = slow_stretch(tracks, scenario)
     return Traced(
         runs=1,
         lattice_least_m=spacing.least_m,
@@ -374,16 +378,18 @@ def trace(tracks: Tracks, scenario: Scenario) -> Traced:
         lattice_kept=spacing.keeps(scenario.formation.gap_m),
         slow_m=slow_m,
         slowest_mps=slowest_mps,
+        slowest_settled_mps=slowest_settled_mps,
     )
 
 
 def slow_stretch(
     tracks: Tracks, scenario: Scenario
-) -> tuple[tuple[float, float] | None, float | None]:
-    """Return the congested stretch of road (start, end) [m], and the lowest mean speed [m/s].
+) -> tuple[tuple[float, float] | None, float | None, float | None]:
+    """Return the congested stretch of road (start, end) [m] and the lowest mean speeds [m/s].
 
     Speeds are means over bins of the road, from the end of the warm-up to the last arrival. The
-    lowest one is that behind S1, where vehicles have settled.
+    first of the lowest ones is that of the road, the second that behind the place up to which
+    vehicles settle at v_F.
     """
     steady = (tracks.t_s >= WARM_UP_S) & (tracks.t_s <= scenario.demand.duration_s)
     bins = max(1, round(scenario.road.length_m / SLOW_BIN_M))
@@ -392,9 +398,11 @@ def slow_stretch(
     total, _ = np.histogram(tracks.s_m[steady], edges_m, weights=tracks.speed_mps[steady])
     driven = np.flatnonzero(count)
     if not len(driven):
-        return None, None
+        return None, None, None
     mean_mps = total[driven] / count[driven]
     slow = driven[mean_mps < SLOW_SHARE * scenario.formation.speed_mps]
     stretch = (float(edges_m[slow[0]]), float(edges_m[slow[-1] + 1])) if len(slow) else None
-    settled = mean_mps[edges_m[driven] >= scenario.road.s1_m]
-    return stretch, round(float(settled.min()), 2) if len(settled) else None
+    settled_m = scenario.formation.speed_mps * scenario.formation.settle_s
+    settled_mps = mean_mps[edges_m[driven] >= settled_m]
+    slowest_settled_mps = round(float(settled_mps.min()), 2) if len(settled_mps) else None
+    return stretch, round(float(mean_mps.min()), 2), slowest_settled_mps

@@ -35,7 +35,7 @@ STABLE: Final = 1.05
 CONGESTED: Final = 1.25
 """A method is congested if its mean travel time exceeds this multiple of free flow."""
 UNDISTURBED: Final = 0.9
-"""Speeds are undisturbed if no stretch of road behind S1 is below this share of v_F on average."""
+"""Speeds are undisturbed if they are not below this share of v_F on average in any 50 m of road."""
 CARRIED: Final = 0.97
 """Minimum ratio of throughput to volume at which the volume is carried."""
 PAPER_STRETCH_M: Final = (500.0, 800.0)
@@ -181,14 +181,16 @@ class _Judge:
     def _smooth(self) -> Statement:
         text = "Formations disturb speeds a little near the beginning, and then drive at v_F"
         row, setting = self._row(OWN, 1600.0), self.evidence.setting
-        if row is None or setting is None or row.traced is None or row.traced.slowest_mps is None:
+        traced = None if row is None else row.traced
+        if setting is None or traced is None or traced.slowest_settled_mps is None:
             return Statement(text, MISSING, "")
-        slowest = row.traced.slowest_mps
         measured = (
-            f"`{OWN}` at 1600: the mean speed is at least {slowest:.2f} m/s in every 50 m of road "
-            "behind S1"
+            f"`{OWN}` at 1600: the mean speed is at least {number(traced.slowest_mps, 2)} m/s in "
+            f"every 50 m of road, and {traced.slowest_settled_mps:.2f} m/s behind the place up to "
+            "which vehicles settle"
         )
-        return Statement(text, measured, _all([slowest >= UNDISTURBED * setting.speed_mps]))
+        kept = traced.slowest_settled_mps >= UNDISTURBED * setting.speed_mps
+        return Statement(text, measured, _all([kept]))
 
     def _better(self) -> Statement:
         text = "Formation control is faster than the rules at these volumes"

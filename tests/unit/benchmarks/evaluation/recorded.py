@@ -52,7 +52,8 @@ TRACED = Traced(
     lattice_worst_off_m=0.07,
     lattice_kept=True,
     slow_m=None,
-    slowest_mps=14.6,
+    slowest_mps=12.9,
+    slowest_settled_mps=14.6,
 )
 
 

@@ -118,9 +118,12 @@ def test_the_congested_stretch() -> None:
     slow = (tracks.s_m > 300.0) & (tracks.s_m < 400.0)
     # Between warm-up and last arrival: 60 to 100 s.
     tracks = evolve(tracks, t_s=tracks.t_s + 60.0, speed_mps=np.where(slow, 3.0, 15.0))
-    assert slow_stretch(tracks, scenario) == ((300.0, 400.0), 3.0)
-    in_s1 = tracks.s_m < scenario.road.s1_m
-    slower = evolve(tracks, speed_mps=np.where(in_s1, 2.0, tracks.speed_mps))
-    assert slow_stretch(slower, scenario) == ((0.0, 400.0), 3.0)
-    assert slow_stretch(evolve(tracks, speed_mps=np.full(401, 15.0)), scenario) == (None, 15.0)
-    assert slow_stretch(evolve(tracks, t_s=tracks.t_s - 60.0), scenario) == (None, None)
+    assert slow_stretch(tracks, scenario) == ((300.0, 400.0), 3.0, 3.0)
+    # Vehicles settle on the first 150 m, in 10 s.
+    settling = tracks.s_m < 150.0
+    slower = evolve(tracks, speed_mps=np.where(settling, 2.0, tracks.speed_mps))
+    assert slow_stretch(slower, scenario) == ((0.0, 400.0), 2.0, 3.0)
+    assert slow_stretch(evolve(tracks, speed_mps=np.full(401, 15.0)), scenario) == (
+        None, 15.0, 15.0,
+    )  # fmt: skip
+    assert slow_stretch(evolve(tracks, t_s=tracks.t_s - 60.0), scenario) == (None, None, None)

@@ -278,6 +278,14 @@ def test_statements_follow_the_data() -> None:
     assert cells(table, "Severe congestion")[2] == "**does not hold**"
     assert "`rule` at 1600, not yet at 1450" in cells(table, "Severe congestion")[1]
     assert cells(table, "The congestion is at")[2] == "holds"
+    assert cells(table, "Formations disturb")[2] == "holds"
+    slow = changed(point("paper-6", 1600.0, 67.0), traced=evolve(TRACED, slowest_settled_mps=13.4))
+    found = cells(statements_table(evidence(slow)), "Formations disturb")
+    assert found[1].endswith(
+        "12.90 m/s in every 50 m of road, "
+        "and 13.40 m/s behind the place up to which vehicles settle"
+    )
+    assert found[2] == "**does not hold**"
     assert cells(table, "Formation control is faster")[2] == "holds"
     bound = cells(table, "At most 3600 v_F / 2 d_F")
     assert bound[0].endswith("here 1800 veh/(lane h)")
