@@ -154,7 +154,7 @@ def _row(point: Point, known: Mapping[str, dict[str, Any]]) -> list[str]:
         run["travel_time_s"] / other["travel_time_s"]
         for run in runs
         if (other := known.get(_key(Point(point.operation), run["seed"]))) is not None
-        and run["travel_time_s"] is not None
+        and None not in (run["travel_time_s"], other["travel_time_s"])
     ]
     stuck = sum(run["demanded"] for run in runs) - left
     off = sum(run["in_another_lane"] for run in runs)

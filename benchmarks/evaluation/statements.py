@@ -208,7 +208,7 @@ class _Judge:
             shown = all(one is Verdict.LESS for one in verdicts)
             kept.append(False if Verdict.MORE in verdicts else shown or None)
         if None in kept:
-            parts.append(f"not judged with fewer than {MIN_SEEDS} seeds, or if an interval has 0")
+            parts.append(f"not judged: fewer than {MIN_SEEDS} seeds, or an interval contains 0")
         return Statement(text, "; ".join(parts), _some(kept))
 
     def _alike_below(self) -> Statement:
@@ -222,10 +222,11 @@ class _Judge:
             ]
             more_s = [one.mean for one in found if one is not None]
             texts = ["-" if one is None else f"{one.mean:+.1f}" for one in found]
-            alike = len(more_s) == len(found) and max(0.0, *more_s) - min(0.0, *more_s) <= ALIKE_S
-            labels = (OWN, *INTERPRETATIONS)
-            alike &= not any(self._travel_s(label, volume) == math.inf for label in labels)
-            kept.append(alike if len(more_s) == len(found) else None)
+            known = len(more_s) == len(found)
+            alike = known and max(0.0, *more_s) - min(0.0, *more_s) <= ALIKE_S
+            if any(self._travel_s(label, volume) == math.inf for label in (OWN, *INTERPRETATIONS)):
+                known, alike = True, False
+            kept.append(alike if known else None)
             if any(one is None or one.bounds is None for one in found):
                 kept.append(None)
             parts.append(f"at {volume:g}: {_series(texts, more_s)}" + (", alike" if alike else ""))

@@ -314,7 +314,7 @@ def test_a_method_is_not_called_faster_after_a_few_seeds() -> None:
     found = cells(statements_table(evidence(*rows)), "Formation control is faster")
     assert found[1].endswith(
         "-2.0 s; `paper-6` minus `rule-net` missing; `paper-6` minus "
-        "`rule-yielding` missing; not judged with fewer than 10 seeds, or if an interval has 0"
+        "`rule-yielding` missing; not judged: fewer than 10 seeds, or an interval contains 0"
     )
     assert found[2] == ""
 
@@ -355,6 +355,7 @@ def test_methods_below_1000_are_alike_unless_they_differ_or_jam() -> None:
     assert found(67.9)[1].count("alike") == 2
     assert found(68.1)[2] == found(65.9)[2] == "**does not hold**"
     assert found(67.9, jams=True)[2] == "**does not hold**"
+    assert found(67.9, (1,), jams=True)[2] == "so far: **does not hold**"
     assert found(67.9, (1, 2))[2] == "so far: holds"
 
 
