@@ -68,7 +68,7 @@ def tuned_comparison(evidence: Evidence) -> str:
         "minimum time to collision [s]", "vehicles that brake harder than 5 m/s2, per run",
         "CO2, petrol [g/km]", "time beyond comfort [%]",
     )  # fmt: skip
-    sentences, compared, judged = [], dict[float, None](), set[float]()
+    sentences, judged = [], dict[float, bool]()
     for volume, own, other in itertools.product(TUNED_VOLUMES, OWN, TUNED):
         found = {
             figure: one
@@ -82,11 +82,10 @@ def tuned_comparison(evidence: Evidence) -> str:
             if one.bounds is not None
         ]
         if found:
-            compared[volume] = None
+            judged[volume] = judged.get(volume, False) or bool(words)
         if words:
-            judged.add(volume)
             sentences.append(f"- At {volume:g}, `{own}` against `{other}`: {', '.join(words)}.")
-    sentences += _without_intervals(volume for volume in compared if volume not in judged)
+    sentences += _without_intervals(volume for volume, known in judged.items() if not known)
     return "\n\n".join([markdown(headings, rows), "\n".join(sentences) or MISSING])
 
 
@@ -139,14 +138,14 @@ def _cell(found: Difference | None, other: str, volume: float) -> str:
 
 
 def _pairs(found: Difference) -> str:
-    """Return how many seeds have both values, if there are others."""
+    """Return as text how many of the common seeds have both values; empty: all of them."""
     if not found.incomplete_pairs:
         return ""
     return f" ({found.seeds} of {found.seeds + found.incomplete_pairs} seeds)"
 
 
 def _without_intervals(volumes: Iterable[float]) -> Iterator[str]:
-    """Yield a sentence about volumes at which no difference has an interval, if there are any."""
+    """Yield a sentence that names the volumes without intervals, if there are any."""
     if names := ", ".join(f"{volume:g}" for volume in volumes):
         yield f"- Without intervals, for which {MIN_SEEDS} seeds are necessary: {names}."
 

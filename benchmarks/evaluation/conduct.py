@@ -59,8 +59,8 @@ class Rounds:
     jobs: int
     """Number of parallel processes."""
     end_s: float | None
-    """Latest expected end of a round (`time.monotonic`); None: no limit. Nothing is expected of a
-    method at a volume before its first run."""
+    """Latest expected end of a round (`time.monotonic`); None: no limit. The expected duration of
+    a method at a volume is 0 before its first run there."""
 
     def run(self, out: Path) -> bool:
         """Run the unfinished rounds; return whether formation control kept its guarantees.
@@ -102,14 +102,14 @@ class Rounds:
 
 
 def _has_run(folder: SweepFolder, point: Point) -> bool:
-    """Return whether a point need not run again.
+    """Return whether the result of a point is recorded, so that it is not run again.
 
     A jam or an overlap of a reference method is a result: it would happen again.
     """
     run = folder.runs.get(point.name)
     if run is None or point.label in FORMATIONS:
         return folder.is_finished(point)
-    return _has_result(run) and (run.has_trajectories or not point.keep_trajectories)
+    return _has_result(run) and folder.has_files(point)
 
 
 def _has_result(run: Run) -> bool:

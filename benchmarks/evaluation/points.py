@@ -89,7 +89,7 @@ class RunRow:
     travel_p95_s: float | None = None
     throughput_veh_per_lane_h: float | None = None
     overlaps: int | None = 0
-    """Pairs of bodies; None: the run has no summary."""
+    """Pairs of vehicles that overlapped; None: the run has no summary."""
     emergency_brakes: int = 0
     hard_brakes: int | None = None
     """Vehicles."""

@@ -128,7 +128,7 @@ class TunedFigure:
     """The figure in words."""
     unit: str
     requirement: str = ""
-    """The maximum in words."""
+    """The maximum difference in words; empty: no requirement."""
     max_percent: float | None = None
     """Maximum difference, relative to the mean of the tuned drivers [%]; None: no requirement."""
 

@@ -87,7 +87,7 @@ class _Judge:
         return row if row is not None and row.seeds else None
 
     def _travel_s(self, label: str, volume: float) -> float | None:
-        """Return the mean travel time; inf: runs have jammed."""
+        """Return the mean travel time [s]; inf: a run jammed; None: it is unknown."""
         row = self.evidence.by_key.get((label, volume))
         if row is None:
             return None
@@ -222,11 +222,12 @@ class _Judge:
             ]
             more_s = [one.mean for one in found if one is not None]
             texts = ["-" if one is None else f"{one.mean:+.1f}" for one in found]
-            known = len(more_s) == len(found)
-            alike = known and max(0.0, *more_s) - min(0.0, *more_s) <= ALIKE_S
+            alike: bool | None = None
             if any(self._travel_s(label, volume) == math.inf for label in (OWN, *INTERPRETATIONS)):
-                known, alike = True, False
-            kept.append(alike if known else None)
+                alike = False
+            elif len(more_s) == len(found):
+                alike = max(0.0, *more_s) - min(0.0, *more_s) <= ALIKE_S
+            kept.append(alike)
             if any(one is None or one.bounds is None for one in found):
                 kept.append(None)
             parts.append(f"at {volume:g}: {_series(texts, more_s)}" + (", alike" if alike else ""))

@@ -34,7 +34,7 @@ The time of a path search grows with n squared, so longer roads get fewer anneal
 _MODE_2_WORK = 1.7
 """Time of an annealing in mode 2, with moves to eight cells, relative to mode 1."""
 _FULL_CYCLE_S = 5.0
-"""T_F [s] in which there is time for `_MAX_WORK`; in shorter slots, the maximum is proportional."""
+"""Shortest T_F [s] with the full `_MAX_WORK`; below it, the maximum is proportional to T_F."""
 
 
 Planner = Callable[
@@ -94,11 +94,12 @@ def stream_road(scenario: Scenario) -> StreamRoad:
     around_m = first_moves_m(
         road.s1_m, road.s2_m, formation.speed_mps, formation.settle_s, in_s2=True
     )
-    advance_m = formation.speed_mps * scenario.timing.cycles_s[0]
+    cycle_s = scenario.timing.cycles_s[0]
+    advance_m = formation.speed_mps * cycle_s
     moves_from_m = scenario.geometry.moves_from_m
     slots = (road.length_m - moves_from_m) / advance_m
     work = max(1.0, slots) ** 2 * (_MODE_2_WORK if mode == 2 else 1.0)
-    max_work = _MAX_WORK * min(1.0, scenario.timing.cycles_s[0] / _FULL_CYCLE_S)
+    max_work = _MAX_WORK * min(1.0, cycle_s / _FULL_CYCLE_S)
     return StreamRoad(
         around_m=around_m,
         lanes=road.lanes,

@@ -175,7 +175,7 @@ class Result:
     not_left: int
     """Number of vehicles that have not left the road."""
     failed: int = 0
-    """Number of runs that failed; those without a summary are in no other figure."""
+    """Number of runs that failed; those without a summary are in no figure but `runs`."""
 
 
 def result_of(runs: Sequence[Run]) -> Result:
@@ -228,9 +228,8 @@ def by_effect(factors: Iterable[Factor], results: Mapping[str, Result]) -> list[
         levels = [results[one.label] for one in factor.levels]
         if any(one.failed and one.delay_s is None for one in levels):
             return math.inf
-        delays_s = [
-            one for one in (*(level.delay_s for level in levels), base_s) if one is not None
-        ]
+        known = [base_s, *(one.delay_s for one in levels)]
+        delays_s = [one for one in known if one is not None]
         return max(delays_s, default=0.0) - min(delays_s, default=0.0)
 
     return sorted(factors, key=effect_s, reverse=True)

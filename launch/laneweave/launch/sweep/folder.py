@@ -118,9 +118,13 @@ class SweepFolder:
     def is_finished(self, point: Point) -> bool:
         """Return whether a point has succeeded and all files that it should keep exist."""
         run = self._runs.get(point.name)
+        return run is not None and not run.reason and self.has_files(point)
+
+    def has_files(self, point: Point) -> bool:
+        """Return whether all files that a point should keep exist."""
+        run = self._runs.get(point.name)
         return (
             run is not None
-            and not run.reason
             and run.summary is not None
             and (run.folder / "trips.parquet").is_file()
             and (not point.keep_trajectories or run.has_trajectories)

@@ -50,7 +50,7 @@ def points(seed: int) -> dict[str, Point]:
 
 @pytest.fixture
 def begun(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Return the names of the points that a sweep would run, instead of running them."""
+    """Record the names of points in the returned list instead of running them."""
     names: list[str] = []
 
     def run_sweep(chosen: Sequence[Point], *_: Any, **__: Any) -> None:  # noqa: ANN401 - not used
@@ -79,6 +79,10 @@ def test_jams_and_overlaps_of_reference_methods_are_results(
         record(tmp_path, points(seed)["formations"], Ending.COMPLETE)
     assert rounds(seeds).run(tmp_path)
     assert begun == [point.name for point in rule[3:]]
+    begun.clear()
+    (tmp_path / SWEEP_FOLDER / rule[0].name / "trips.parquet").unlink()
+    assert rounds(seeds).run(tmp_path)
+    assert begun == [point.name for point in (rule[0], *rule[3:])]
 
 
 def test_failures_of_formation_control_are_repeated_and_reported(

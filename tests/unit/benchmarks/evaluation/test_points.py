@@ -57,6 +57,8 @@ def test_means_extremes_and_sums_over_seeds() -> None:
         ]
     )
     assert row.seeds == (1, 2)
+    failed = [(one.seed, one.reason) for one in row.runs if one.reason]
+    assert failed == [(2, "2 pairs of vehicles overlapped")]
     assert (row.overlaps, row.unfinished) == (2, 0)
     assert (row.mean("travel_s"), row.mean("travel_p95_s")) == (71.0, 72.0)
     assert (row.total("left"), row.total("on_preferred_lane")) == (200, 199)
@@ -78,6 +80,7 @@ def test_of_runs_that_were_cut_off_only_overlaps_count() -> None:
         ]
     )
     assert row.seeds == (1,)
+    assert [one.seed for one in row.runs if not one.complete] == [2, 3]
     assert (row.unfinished, row.jammed) == (2, 1)
     assert (row.values("travel_s"), row.total("demanded"), row.overlaps) == ([70.0], 100, 1)
 

@@ -489,6 +489,7 @@ def test_formation_control_is_compared_seed_by_seed() -> None:
     assert shown[1] == "-1.00 [-1.00, -1.00]"
     assert shown[2].endswith("]")
     assert shown[3].endswith(" (7 of 10 seeds)")
+    assert shown[6] == "missing"
 
 
 def test_operations_are_compared_with_tuned_drivers() -> None:
@@ -498,7 +499,7 @@ def test_operations_are_compared_with_tuned_drivers() -> None:
             one, co2_g_per_km=co2, ttc_below_3_s=1.5, min_ttc_s=2.0 + one.seed, hard_brakes=one.seed
         )
         for label, travel_s, co2 in (
-            ("formations", 66.0, 132.0), ("lc2013-tuned", 67.0, 130.0), ("lc2013", 68.0, 0.0)
+            ("formations", 66.0, 132.0), ("lc2013-tuned", 67.0, 130.0), ("lc2013", 68.0, 140.0)
         )
         for one in point(label, 1000.0, travel_s, seeds=seeds).runs
     ]  # fmt: skip
