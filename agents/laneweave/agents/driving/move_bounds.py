@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import math
-
 from attrs import frozen
 
 from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.timing import MIN_TTC_S, longest_ttc_s
 from laneweave.protocol.scenario.vehicle_tables import Vehicle
-from laneweave.protocol.summary import TTC_SHORT_S
 from laneweave.protocol.vehicle.emergency_brake import (
     ERROR_SIGMAS,
     last_tick_m,
@@ -22,8 +20,6 @@ TRACKING_ERROR_M = 0.25
 """Margin for tracking errors behind the vehicle ahead."""
 CLOSING_SPEEDUP = 0.5
 """Maximum closing speed that the tangents cover, as a fraction of v_F."""
-MIN_TTC_S = TTC_SHORT_S + 0.2
-"""Minimum time to collision of a gentle move, with a margin for tracking errors."""
 _APPROACH_SHARE = 0.59
 """Minimum time to collision of a gentle forward move, as a fraction of the longest possible one. A
 vehicle that closes up early brakes for longer, and burns no fuel meanwhile."""
@@ -68,13 +64,10 @@ class TtcBound:
 
 
 def ttc_bounds(dx: int, gap_m: float, pitch_m: float, duration_s: float) -> tuple[TtcBound, ...]:
-    """Return the bounds that a move by `dx` columns should keep, the longest time first.
-
-    The longest possible time to collision is that of a gap which shrinks exponentially.
-    """
+    """Return the bounds that a move by `dx` columns should keep, the longest time first."""
     if dx == 0:
         return ()
-    longest_s = duration_s / math.log(gap_m / (gap_m - pitch_m))
+    longest_s = longest_ttc_s(gap_m, pitch_m, duration_s)
     approach_s = max(MIN_TTC_S, _APPROACH_SHARE * longest_s) if dx > 0 else MIN_TTC_S
     times_s = sorted({approach_s, MIN_TTC_S}, reverse=True)
     return tuple(TtcBound(gap_m, ttc_s, dx) for ttc_s in times_s)

@@ -11,6 +11,7 @@ from attrs import frozen
 from laneweave.protocol.road_layout import LaneSection
 from laneweave.protocol.scenario.formation_table import FormationSettings
 from laneweave.protocol.scenario.vehicle_tables import PEAK_ACCEL, Vehicle
+from laneweave.protocol.summary import TTC_SHORT_S
 
 SHORTEST_CYCLE_S, LONGEST_CYCLE_S = 4.0, 7.0
 """Range of T_F if `formation.cycle_s` is not set; the lower end is the paper's value."""
@@ -21,13 +22,26 @@ ROLLING_CYCLES_S = ((2000.0, 6.0), (2200.0, 5.4), (math.inf, 5.0))
 denser traffic needs more steps on the same road (decision 76)."""
 GENTLE_RATIO = 0.9
 """Maximum ratio between the acceleration of a minimum-jerk move and its limit at which there is a
-gentle move of the same duration (decision 76), if d_F is 12 m or more."""
+gentle move of the same duration (decision 76), if that also permits its time to collision."""
+MIN_TTC_S = TTC_SHORT_S + 0.2
+"""Minimum time to collision of a gentle move, with a margin for tracking errors."""
+GENTLE_TTC_SHARE = 0.7
+"""Minimum time to collision that a move can keep within the limits of a car, as a fraction of
+`longest_ttc_s`."""
 MIN_MERGING_SLOTS = 4
 """Number of slots that the rolling operation should have in a lane that begins and ends on the
 road, as that of a ramp; with three, up to 1 % of the vehicles did not change lanes in time at 2000
 vehicles/(lane h)."""
 CYCLE_STEP_S = 0.2
 """Step between values of T_F; few values keep the number of planned trajectories low."""
+
+
+def longest_ttc_s(gap_m: float, closer_m: float, duration_s: float) -> float:
+    """Return the longest possible minimum time to collision while a gap shrinks by `closer_m`.
+
+    It is that of a gap which shrinks exponentially.
+    """
+    return duration_s / math.log(gap_m / (gap_m - closer_m))
 
 
 @frozen
@@ -114,12 +128,19 @@ class Timing:
 
     @property
     def gentle_cycle_s(self) -> float:
-        """Shortest T_F [s] in which moves by a column are gentle; if none, the longest."""
-        return self._shortest_within(GENTLE_RATIO * self._cars.max_accel_mps2)
+        """Shortest T_F [s] in which moves by a column are gentle for cars; if none, the longest."""
+        pitch_m = self._formation.gap_m
+        beyond_m = 2.0 * pitch_m - self._cars.length_m
+        min_s = MIN_TTC_S / (GENTLE_TTC_SHARE * longest_ttc_s(beyond_m, pitch_m, 1.0))
+        by_ttc_s = self._shortest_from(min_s)
+        return max(self._shortest_within(GENTLE_RATIO * self._cars.max_accel_mps2), by_ttc_s)
 
     def _shortest_within(self, accel_mps2: float) -> float:
         """Return the shortest T_F with minimum-jerk moves within a limit; if none, the longest."""
-        min_s = math.sqrt(PEAK_ACCEL * self._formation.gap_m / accel_mps2)
+        return self._shortest_from(math.sqrt(PEAK_ACCEL * self._formation.gap_m / accel_mps2))
+
+    def _shortest_from(self, min_s: float) -> float:
+        """Return the shortest T_F with moves of at least `min_s`; if none, the longest."""
         enough = (one for one in self.slots_s if one >= min_s + self._formation.slack_s)
         return min(enough, default=self.slots_s[-1])
 

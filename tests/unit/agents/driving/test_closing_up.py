@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from laneweave.agents.driving.move_bounds import MIN_TTC_S, TRACKING_ERROR_M, Envelope
+from laneweave.agents.driving.move_bounds import TRACKING_ERROR_M, Envelope
 from laneweave.agents.driving.qp_solver import SOLVED, QPResult, QuadraticProgram
 from laneweave.agents.driving.trajectory import (
     Trajectory,
@@ -19,6 +19,7 @@ from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell, displacements
 from laneweave.protocol.scenario.fields import Scenario
+from laneweave.protocol.scenario.timing import MIN_TTC_S
 from laneweave.protocol.vehicle.emergency_brake import ERROR_SIGMAS, EmergencyBrake, spare_error_m
 from laneweave.protocol.vehicle.motion import Jerk, cell_state
 from laneweave.protocol.wire.messages import Neighbour
@@ -156,7 +157,11 @@ def test_moves_keep_what_the_limits_allow() -> None:
 
 
 @pytest.mark.parametrize(
-    ("gap_m", "max_accel_mps2"), [(12.0, 3.5), (15.0, 5.0), (15.0, 3.0), (20.0, 5.0), (25.0, 5.0)]
+    ("gap_m", "max_accel_mps2"),
+    [
+        *((9.0, 5.0), (10.0, 3.5), (10.0, 5.0), (11.0, 5.0), (12.0, 3.5), (12.0, 5.0), (13.0, 5.0)),
+        *((15.0, 5.0), (15.0, 3.0), (20.0, 5.0), (25.0, 5.0)),
+    ],
 )
 def test_the_shortest_slots_with_gentle_moves(gap_m: float, max_accel_mps2: float) -> None:
     tables = {"formation": {"gap_m": gap_m}, "vehicle": {"max_accel_mps2": max_accel_mps2}}

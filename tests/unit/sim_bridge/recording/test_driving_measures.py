@@ -251,6 +251,14 @@ def test_a_faster_vehicle_ahead_is_no_conflict() -> None:
     assert set(found.ttc_below_s.values()) == {0.0}
 
 
+def test_a_closing_speed_of_nearly_nothing_is_no_conflict() -> None:
+    y_m = lane_y_m(0)
+    tick = {"a": Row(0.0, y_m, speed_mps=5e-324), "b": Row(30.0, y_m, speed_mps=0.0)}
+    found = measured([tick])
+    assert found.min_ttc_s == math.inf
+    assert found.max_drac_mps2 == 0.0
+
+
 def lane_change(after: int, behind_m: float, leaves_at: int = 10**6) -> list[Tick]:
     """Return ticks in which one vehicle changes lanes in front of another one, both at 15 m/s."""
     return [
