@@ -12,7 +12,8 @@ import pyarrow.parquet as pq
 from attrs import frozen
 
 from laneweave.launch.explain.explanation import Explanation, explain
-from laneweave.launch.recordings.runs import not_a_run, scenario_of, unreadable
+from laneweave.launch.recordings.files import EVENTS, TRIPS, not_a_run, reading
+from laneweave.launch.recordings.runs import scenario_of
 from laneweave.launch.recordings.trajectories import read_trajectories
 from laneweave.protocol.errors import unknown_name
 from laneweave.protocol.scenario.fields import Scenario
@@ -40,7 +41,7 @@ class RecordedRun:
         Raises:
             BadInputError: the file cannot be read.
         """
-        return self._table("trips.parquet")
+        return self._table(TRIPS)
 
     def trajectories(self, columns: Sequence[str] | None = None) -> pa.Table:
         """Return the recorded states of all vehicles, in the order of time.
@@ -72,14 +73,11 @@ class RecordedRun:
             BadInputError: the file cannot be read, or the run has no such event and this release no
                 such kind.
         """
-        try:
-            with (self.folder / "events.jsonl").open(encoding="utf-8") as lines:
-                events = [json.loads(line) for line in lines]
-        except (OSError, ValueError) as error:
-            raise not_a_run(self.folder, error) from error
+        with reading(self.folder, EVENTS), (self.folder / EVENTS).open(encoding="utf-8") as lines:
+            events = [json.loads(line) for line in lines]
+            found = [event for event in events if kind in (None, event["kind"])]
         if kind is None:
             return events
-        found = [event for event in events if event["kind"] == kind]
         # Plug-ins and other releases have kinds of their own.
         if not found and kind not in FIELDS:
             raise unknown_name("kind", kind, FIELDS)
@@ -99,10 +97,8 @@ class RecordedRun:
         return explain(self.folder, vehicle)
 
     def _table(self, name: str) -> pa.Table:
-        try:
+        with reading(self.folder, name):
             return pq.read_table(self.folder / name)
-        except (OSError, ValueError) as error:
-            raise unreadable(self.folder, name, error) from error
 
 
 def load_run(folder: Path | str) -> RecordedRun:
@@ -117,8 +113,6 @@ def load_run(folder: Path | str) -> RecordedRun:
     summary = read_summary(folder)
     if summary is None:
         raise not_a_run(folder, "its summary.json is missing or incomplete")
-    try:
-        scenario = scenario_of(folder / "trips.parquet")
-    except (OSError, ValueError) as error:
-        raise not_a_run(folder, error) from error
+    with reading(folder, TRIPS):
+        scenario = scenario_of(folder / TRIPS)
     return RecordedRun(folder, summary, scenario)

@@ -9,6 +9,7 @@ from typing import Any
 
 from attrs import define, field, frozen
 
+from laneweave.launch.recordings.files import EVENTS, reading
 from laneweave.launch.recordings.formations import read_events
 from laneweave.protocol.wire.events import PART_CLOSED, PART_OPENED
 from laneweave.protocol.wire.obstacle_messages import PASSING
@@ -83,19 +84,20 @@ def closed_for_a_time(folder: Path) -> list[ClosedForATime]:
     """Return the parts of lanes that were closed for a time, but for those that moved.
 
     Raises:
-        OSError, ValueError, KeyError, TypeError: the events cannot be read.
+        BadInputError: the events cannot be read.
     """
     closed = ClosedParts()
-    for event in read_events(folder, PART_CLOSED, PART_OPENED):
-        if event.get("cause") != PASSING:
-            closed.add(event)
-    return [
-        ClosedForATime(
-            int(one.first["lane"]),
-            float(one.first["from_m"]),
-            float(one.newest["to_m"]),
-            one.since_s,
-            one.until_s,
-        )
-        for one in closed.parts
-    ]
+    with reading(folder, EVENTS):
+        for event in read_events(folder, PART_CLOSED, PART_OPENED):
+            if event.get("cause") != PASSING:
+                closed.add(event)
+        return [
+            ClosedForATime(
+                int(one.first["lane"]),
+                float(one.first["from_m"]),
+                float(one.newest["to_m"]),
+                one.since_s,
+                one.until_s,
+            )
+            for one in closed.parts
+        ]

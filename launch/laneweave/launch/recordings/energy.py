@@ -20,7 +20,7 @@ import pyarrow as pa
 import pyarrow.csv as pc
 import pyarrow.parquet as pq
 
-from laneweave.launch.recordings.runs import TRAJECTORIES, unreadable
+from laneweave.launch.recordings.files import TRAJECTORIES, reading
 from laneweave.protocol.errors import CommandFailedError
 from laneweave.protocol.runtime.temporary_folders import temporary_folder
 from laneweave.protocol.summary import EnergyFigures
@@ -85,14 +85,11 @@ def energy_of(folder: Path, models: Mapping[str, str] = MODELS) -> dict[str, Ene
 
 def _speeds(folder: Path) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Yield speeds [m/s] and accelerations [m/s2] of a run in parts."""
-    try:
-        with pq.ParquetFile(folder / TRAJECTORIES) as file:
-            names = ["speed_mps", "accel_mps2"]
-            for batch in file.iter_batches(ROWS_AT_ONCE, columns=names):
-                speed_mps, accel_mps2 = (column.to_numpy() for column in batch.columns)
-                yield speed_mps.astype(np.float64), accel_mps2.astype(np.float64)
-    except (OSError, ValueError, KeyError) as error:
-        raise unreadable(folder, TRAJECTORIES, error) from error
+    with reading(folder, TRAJECTORIES), pq.ParquetFile(folder / TRAJECTORIES) as file:
+        names = ["speed_mps", "accel_mps2"]
+        for batch in file.iter_batches(ROWS_AT_ONCE, columns=names):
+            speed_mps, accel_mps2 = (column.to_numpy() for column in batch.columns)
+            yield speed_mps.astype(np.float64), accel_mps2.astype(np.float64)
 
 
 def _sums(program: Path, cycle: Path, model: str) -> dict[str, float]:

@@ -10,6 +10,7 @@ from typing import Any
 import pyarrow.parquet as pq
 
 from laneweave.launch.formation_columns import FormationColumns, Formations
+from laneweave.launch.recordings.files import EVENTS, TRIPS, reading
 from laneweave.protocol.lattice import Lattice
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.wire.events import FORMATION_CLOSED
@@ -19,15 +20,15 @@ def read_events(folder: Path, *kinds: str) -> Iterator[Mapping[str, Any]]:
     """Yield the recorded events of the given kinds (none given: all), in the order of the file.
 
     Raises:
-        OSError, ValueError, KeyError, TypeError: the events cannot be read.
+        BadInputError: the events cannot be read.
     """
-    path = folder / "events.jsonl"
+    path = folder / EVENTS
     if not path.is_file():
         return
-    for line in path.read_text(encoding="utf-8").splitlines():
-        event = json.loads(line)
-        if not kinds or event["kind"] in kinds:
-            yield event
+    with reading(folder, EVENTS):
+        events = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+        chosen = [event for event in events if not kinds or event["kind"] in kinds]
+    yield from chosen
 
 
 def closed_formations(folder: Path, scenario: Scenario) -> Formations:
@@ -44,15 +45,17 @@ def recorded_formations(folder: Path, lattice: Lattice) -> Formations:
     lattice counts as a formation.
 
     Raises:
-        OSError, ValueError, KeyError, TypeError: a file of the run cannot be read.
+        BadInputError: a file of the run cannot be read.
     """
     found: dict[int, FormationColumns] = {}
-    for event in read_events(folder, FORMATION_CLOSED):
-        if event.get("role") == "bridge":
-            rear, front = event["columns"]
-            number = int(event["formation"])
-            found[number] = FormationColumns(number, int(rear), int(front), float(event["t_s"]))
-    trips = pq.read_table(folder / "trips.parquet", columns=["formation"])
+    with reading(folder, EVENTS):
+        for event in read_events(folder, FORMATION_CLOSED):
+            if event.get("role") == "bridge":
+                rear, front = event["columns"]
+                number = int(event["formation"])
+                found[number] = FormationColumns(number, int(rear), int(front), float(event["t_s"]))
+    with reading(folder, TRIPS):
+        trips = pq.read_table(folder / TRIPS, columns=["formation"])
     numbers: set[int] = set(trips["formation"].drop_null().to_pylist())  # type: ignore[arg-type]
     for number in numbers:
         columns = lattice.block_range(number)

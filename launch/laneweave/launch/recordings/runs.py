@@ -11,18 +11,18 @@ from typing import Any
 import pyarrow.parquet as pq
 from attrs import evolve, frozen
 
+from laneweave.launch.recordings.files import TRAJECTORIES, TRIPS, not_a_run, reading
 from laneweave.launch.run_methods import FORMATION, rank
 from laneweave.protocol.config.scenario_files import parse_scenario, to_tables
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.operations import DEFAULT_OPERATION
-from laneweave.protocol.summary import SUMMARY_FILE, Ending, RunSummary, read_summary
+from laneweave.protocol.summary import Ending, RunSummary, read_summary
 from laneweave.sim_bridge.recording.columns import SCENARIO_KEY
 
 SWEEP_FILE, POINT_FILE = "sweep.json", "point.json"
 """Files that identify the folders of sweeps and of their points."""
 POINT_SCHEMA = "laneweave.sweep.point/1"
-TRAJECTORIES = "trajectories.parquet"
 
 
 @frozen
@@ -156,12 +156,11 @@ def single_run(folder: Path) -> Run:
             its point in a sweep cannot be read.
     """
     if not (folder / TRAJECTORIES).is_file():
-        raise BadInputError("DIR", str(folder), "the folder of a run, with trajectories.parquet")
-    try:
+        raise BadInputError("folder", str(folder), "the folder of a run, with trajectories.parquet")
+    with reading(folder, TRAJECTORIES):
         scenario = scenario_of(folder / TRAJECTORIES)
-        pq.read_schema(folder / "trips.parquet")
-    except (OSError, ValueError) as error:
-        raise not_a_run(folder, error) from error
+    with reading(folder, TRIPS):
+        pq.read_schema(folder / TRIPS)
     summary = read_summary(folder)
     if summary is None:
         raise not_a_run(folder, "its summary.json is missing or incomplete")
@@ -184,7 +183,7 @@ def runs_of(folders: Sequence[Path]) -> Iterator[Run]:
             continue
         points = sweep_runs(folder)
         if all(run.reason for run in points):
-            raise BadInputError("DIR", str(folder), "a sweep with a finished run")
+            raise BadInputError("folder", str(folder), "a sweep with a finished run")
         yield from points
 
 
@@ -227,16 +226,3 @@ def _read_point(path: Path) -> Run:
         )
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise BadInputError(str(path), "invalid", f"the record of a point ({error})") from error
-
-
-def not_a_run(folder: Path, why: object) -> BadInputError:
-    """Return the error for a folder that is not that of a finished run."""
-    return BadInputError("DIR", str(folder), f"the folder of a finished run ({why})")
-
-
-def unreadable(folder: Path, file: str, why: object) -> BadInputError:
-    """Return the error for a recording of a run that cannot be read."""
-    if (folder / SUMMARY_FILE).is_file() and not (folder / file).exists():
-        kept = "a run that kept this file; trajectories in a sweep: --keep-trajectories all"
-        return BadInputError(file, f"none in {folder}", kept)
-    return not_a_run(folder, why)

@@ -19,8 +19,9 @@ import pyarrow.parquet as pq
 from attrs import frozen
 from numpy.typing import NDArray
 
-from laneweave.launch.recordings.runs import TRAJECTORIES as FILE
-from laneweave.launch.recordings.runs import scenario_of, unreadable
+from laneweave.launch.recordings.files import TRAJECTORIES as FILE
+from laneweave.launch.recordings.files import TRIPS, reading
+from laneweave.launch.recordings.runs import scenario_of
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Lattice
 from laneweave.sim_bridge.recording.columns import SCHEMA_KEY, TRAJECTORIES
@@ -98,9 +99,10 @@ def read_trips(folder: Path) -> dict[str, dict[str, Any]]:
     """Return the trips of a run by vehicle.
 
     Raises:
-        OSError, ValueError: the trips cannot be read.
+        BadInputError: the trips cannot be read.
     """
-    return {trip["vehicle"]: trip for trip in pq.read_table(folder / "trips.parquet").to_pylist()}
+    with reading(folder, TRIPS):
+        return {trip["vehicle"]: trip for trip in pq.read_table(folder / TRIPS).to_pylist()}
 
 
 def read_trajectories(folder: Path, columns: Sequence[str] | None = None) -> pa.Table:
@@ -117,7 +119,7 @@ def read_trajectories(folder: Path, columns: Sequence[str] | None = None) -> pa.
     for name in names:
         if name not in TRAJECTORIES.names:
             raise BadInputError("columns", name, "any of " + ", ".join(TRAJECTORIES.names))
-    try:
+    with reading(folder, FILE):
         schema = (pq.read_schema(folder / FILE).metadata or {}).get(SCHEMA_KEY)
         if schema is None:
             return _from_first_schema(folder, names)
@@ -125,8 +127,6 @@ def read_trajectories(folder: Path, columns: Sequence[str] | None = None) -> pa.
             wanted = f"a recording with schema {TRAJECTORIES.schema} or an earlier one"
             raise BadInputError(FILE, schema.decode(), wanted)
         return pq.read_table(folder / FILE, columns=names)
-    except (OSError, ValueError, KeyError) as error:
-        raise unreadable(folder, FILE, error) from error
 
 
 def _from_first_schema(folder: Path, names: Sequence[str]) -> pa.Table:

@@ -20,6 +20,7 @@ from laneweave.coordinator.planning.path_map import RelativePathMap
 from laneweave.launch.drawing.colours import lane_colours, text_colour, vehicle_colour
 from laneweave.launch.drawing.figures import INK, write
 from laneweave.launch.formation_columns import FormationColumns
+from laneweave.launch.recordings.files import EVENTS, reading
 from laneweave.launch.recordings.formations import read_events, recorded_formations
 from laneweave.launch.recordings.runs import Run
 from laneweave.launch.recordings.trajectories import NO_LATTICE, Floats, Tracks, read_trips
@@ -90,8 +91,7 @@ def driven_map(run: Run, tracks: Tracks, formation: int | None) -> DrivenMap | N
     """Return the path map of a formation, by default the one with the most moves, or None.
 
     Raises:
-        BadInputError: the run has no such formation.
-        OSError, ValueError, KeyError, TypeError: a file of the run cannot be read.
+        BadInputError: the run has no such formation, or a file of it cannot be read.
     """
     columns = recorded_formations(run.folder, run.scenario.lattice).by_number
     trips = read_trips(run.folder)
@@ -182,14 +182,15 @@ def _driven_slots(
     tick_s, slot_s = run.scenario.runtime.tick_s, run.scenario.timing.cycles_s[0]
     last_s = max(changes_s, default=math.inf) + 0.5 * tick_s
     together, found = {formation}, None
-    for event in read_events(run.folder, FORMATIONS_JOINED, PLAN_MADE):
-        if event.get("role") != "coordinator":
-            continue
-        if event["kind"] == FORMATIONS_JOINED and formation in event["formations"]:
-            together.update(event["formations"])
-        if event["kind"] == PLAN_MADE and event["formation"] in together and "t0_s" in event:
-            slots = float(event["t0_s"]), float(event["slot_s"])
-            found = slots if slots[0] <= last_s and slots[1] > 0.0 else found
+    with reading(run.folder, EVENTS):
+        for event in read_events(run.folder, FORMATIONS_JOINED, PLAN_MADE):
+            if event.get("role") != "coordinator":
+                continue
+            if event["kind"] == FORMATIONS_JOINED and formation in event["formations"]:
+                together.update(event["formations"])
+            if event["kind"] == PLAN_MADE and event["formation"] in together and "t0_s" in event:
+                slots = float(event["t0_s"]), float(event["slot_s"])
+                found = slots if slots[0] <= last_s and slots[1] > 0.0 else found
     if found is not None:
         return found
     # The first move may be late by at most the slack of a slot.

@@ -19,7 +19,7 @@ from pathlib import Path
 
 from attrs import frozen
 
-from laneweave.launch.recordings.runs import TRAJECTORIES
+from laneweave.launch.recordings.files import EVENTS, TRAJECTORIES, TRIPS
 from laneweave.launch.run.roles import THREAD_LIMITS
 from laneweave.launch.sweep.points import Point
 from laneweave.protocol.config.scenario_files import to_tables
@@ -46,7 +46,7 @@ class PointResult:
 
 def kept_files(point: Point) -> tuple[str, ...]:
     """Return the names of the files to keep, besides `LOG_FILE` after a failure."""
-    kept = (SUMMARY_FILE, "trips.parquet", "events.jsonl")
+    kept = (SUMMARY_FILE, TRIPS, EVENTS)
     return (*kept, TRAJECTORIES) if point.keep_trajectories else kept
 
 

@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 
 from laneweave.launch.drawing.colours import trip_lane
 from laneweave.launch.formation_columns import Formations
+from laneweave.launch.recordings.files import EVENTS, reading
 from laneweave.launch.recordings.formations import closed_formations, read_events
-from laneweave.launch.recordings.runs import not_a_run, single_run
+from laneweave.launch.recordings.runs import single_run
 from laneweave.launch.recordings.trajectories import NO_LATTICE, Tracks, read_tracks, read_trips
 from laneweave.launch.run_methods import FORMATION
 from laneweave.launch.watch.frames import (
@@ -79,13 +80,11 @@ class Recording:
             BadInputError: the folder does not hold a finished run with trajectories.
         """
         run = single_run(folder)
-        try:
-            self._tracks = read_tracks(folder)
-            self._trips = read_trips(folder)
+        self._tracks = read_tracks(folder)
+        self._trips = read_trips(folder)
+        with reading(folder, EVENTS):
             self._moments = list(_moments(folder))
-            self._formations = closed_formations(folder, run.scenario).by_number
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise not_a_run(folder, error) from error
+        self._formations = closed_formations(folder, run.scenario).by_number
         self._run = run
         self._lane_ends = LaneEnds(run.scenario)
         tick_s = run.scenario.runtime.tick_s

@@ -13,7 +13,7 @@ import pytest
 
 from laneweave.launch.recordings import energy
 from laneweave.launch.recordings.energy import MODELS, energy_of
-from laneweave.launch.recordings.runs import TRAJECTORIES
+from laneweave.launch.recordings.files import TRAJECTORIES
 from laneweave.launch.run.reference_run import ReferenceRun
 from laneweave.launch.run_methods import LC2013
 from laneweave.protocol.config.scenario_files import load_scenario

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Callable
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -174,16 +175,50 @@ def test_one_line_says_what_is_wrong(
     Path("torn", "trajectories.parquet").write_bytes(b"PAR1")
     Path("begun", "sweep.json").touch()
     for words, said in (
-        ("missing", "DIR: got 'missing'; allowed: the folder of a run"),
-        ("empty", "DIR: got 'empty'; allowed: the folder of a run"),
-        ("torn", "DIR: got 'torn'; allowed: the folder of a finished run"),
-        ("short", "DIR: got 'short'; allowed: the folder of a finished run"),
-        ("unfinished", "DIR: got 'unfinished'; allowed: the folder of a finished run"),
-        ("begun", "DIR: got 'begun'; allowed: a sweep with a finished run"),
+        ("missing", "folder: got 'missing'; allowed: the folder of a run"),
+        ("empty", "folder: got 'empty'; allowed: the folder of a run"),
+        ("torn", "folder: got 'torn'; allowed: the folder of a finished run"),
+        ("short", "trips.parquet: got 'none in short'; allowed: a run that kept this file"),
+        ("unfinished", "folder: got 'unfinished'; allowed: the folder of a finished run"),
+        ("begun", "folder: got 'begun'; allowed: a sweep with a finished run"),
         ("run --formation 99", "--formation: got 99; allowed: a formation of run: "),
         ("run --out x", "--out: got 'x'; allowed: only with several folders"),
     ):
         assert said in laneweave.refused("report", *words.split())
+
+
+@pytest.mark.parametrize(
+    ("file", "damage", "of_sweep"),
+    [
+        ("events.jsonl", lambda content: content[:-5], False),
+        ("events.jsonl", lambda content: content[:-5], True),
+        ("events.jsonl", lambda content: content + b"[]", False),
+        ("events.jsonl", lambda content: content + b'{"t_s": 1.0}', False),
+        ("events.jsonl", lambda content: content + b'{"kind": "formation-closed"}\xff', False),
+        ("events.jsonl", lambda _: b'{"kind": "formation-closed", "role": "bridge"}\n', False),
+        ("events.jsonl", lambda _: b'{"kind": "part-closed"}\n', False),
+        ("trips.parquet", lambda content: content[:100], True),
+        ("trips.parquet", lambda content: content[:4] + bytes(len(content) - 4), True),
+        ("trips.parquet", lambda content: content[:4] + bytes(1000) + content[1004:], False),
+        ("trajectories.parquet", lambda content: content[:4] + bytes(999) + content[1003:], True),
+    ],
+)
+def test_one_line_names_the_damaged_file(
+    laneweave: Here,
+    swept: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    file: str,
+    damage: Callable[[bytes], bytes],
+    of_sweep: bool,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(swept, "sweep")
+    damaged = Path("sweep", "formation-1600-1", file)
+    damaged.write_bytes(damage(damaged.read_bytes()))
+    said = laneweave.refused("report", "sweep" if of_sweep else damaged.parent)
+    assert str(damaged.parent) in said
+    assert file in said
 
 
 def test_an_error_of_the_report_is_not_reported_as_bad_input(
