@@ -111,6 +111,13 @@ class TravelTime:
         "by type of vehicle (car: the scenario's table vehicle)"
     )
 
+    @property
+    def delay_s(self) -> float | None:
+        """Mean excess over the time at v_F from the entrance to the destination [s]."""
+        by_entrance = (self.by_entrance or {}).values()
+        counted = sum(one.n for one in by_entrance)
+        return sum(one.n * one.delay for one in by_entrance) / counted if counted else None
+
 
 @frozen(kw_only=True)
 class Safety:
@@ -139,7 +146,9 @@ class Safety:
         "commands that motion controllers refused, as no correct agent sends them"
     )
     min_ttc_s: float | None = optional(
-        "minimum time to collision of two vehicles in line; absent: none approached another", "s"
+        "minimum time to collision of two vehicles of this system in line; absent: none approached "
+        "another",
+        "s",
     )
     ttc_below_3_s: float | None = optional(
         f"time that vehicles spent below {TTC_SHORT_S:g} s to collision, summed over vehicles", "s"

@@ -39,7 +39,7 @@ _DELAY_S: Final = 0.5
 _LOSS: Final = 0.3
 """Added to the loss in the cellular network and to the share of time in bursts."""
 _MAX_LOSS: Final = 0.9
-"""Maximum of both."""
+"""Maximum up to which it is added."""
 
 
 @frozen
@@ -142,12 +142,17 @@ def _radio_ends(radio: Radio) -> Iterator[tuple[str, tuple[None, End]]]:
     if not radio.enabled:
         enabled = {"radio.technology": C_V2X}
         yield "radio", (None, ("C-V2X", enabled))
-    delay_s, loss = radio.cellular_delay_s + _DELAY_S, min(radio.cellular_loss + _LOSS, _MAX_LOSS)
+    delay_s = radio.cellular_delay_s + _DELAY_S
     text = f"{delay_s:g} s by the network"
     yield "delay", (None, (text, {**enabled, "radio.cellular_delay_s": delay_s}))
-    share = min(radio.burst_share + _LOSS, _MAX_LOSS)
-    settings = {**enabled, "radio.cellular_loss": loss, "radio.burst_share": share}
-    yield "loss", (None, (f"{100.0 * _LOSS:g} % more, and in bursts", settings))
+    loss, share = (
+        round(max(one, min(one + _LOSS, _MAX_LOSS)), 6)
+        for one in (radio.cellular_loss, radio.burst_share)
+    )
+    if (loss, share) != (radio.cellular_loss, radio.burst_share):
+        settings = {**enabled, "radio.cellular_loss": loss, "radio.burst_share": share}
+        text = f"{100.0 * loss:g} %, and in bursts for {100.0 * share:g} % of the time"
+        yield "loss", (None, (text, settings))
 
 
 def _scaled(field: str, value: float, shift: float, unit: str) -> tuple[End, End]:
@@ -161,8 +166,7 @@ class Result:
 
     runs: int
     delay_s: float | None
-    """Mean travel time, less the time that the length of the road takes at v_F; only of runs in
-    which all vehicles have left."""
+    """Mean of `TravelTime.delay_s` over the runs in which all vehicles have left."""
     delays_s: tuple[float, ...]
     """The same of each of these runs."""
     arrived_percent: float | None
@@ -181,11 +185,11 @@ class Result:
 def result_of(runs: Sequence[Run]) -> Result:
     """Return the results of runs that differ in their seeds only."""
     delays_s = [
-        mean_s - run.scenario.road.length_m / run.scenario.formation.speed_mps
+        delay_s
         for run in runs
         if run.summary is not None
         and run.summary.ending == Ending.COMPLETE.value
-        and (mean_s := run.summary.travel_time_s.mean) is not None
+        and (delay_s := run.summary.travel_time_s.delay_s) is not None
     ]
     summaries = [run.summary for run in runs if run.summary is not None]
     petrol = [

@@ -11,8 +11,8 @@ import math
 import random
 from collections.abc import Iterable, Mapping, Sequence
 from statistics import fmean
-from types import MappingProxyType
-from typing import Any, Final
+from types import MappingProxyType, NoneType
+from typing import Final, get_args, get_type_hints
 
 from attrs import frozen
 
@@ -39,8 +39,8 @@ OTHER_LANE_S: Final = 1.0
 """Penalty for each percent of vehicles that leave neither in their lane nor at their exit [s]."""
 _LOGARITHMIC: Final = 10.0
 """Ranges whose ends have at least this ratio are drawn uniformly in the logarithm."""
-_NOT_VARIED: Final = ("demand.volume_veh_per_lane_h", "demand.duration_s")
-"""Fields that all sets of a search must share."""
+_SHARED: Final = ("road", "demand", "radio", "sensing")
+"""Tables that all sets of a search share: on another road, travel times say nothing about a set."""
 
 
 @frozen
@@ -104,17 +104,18 @@ def ranges_of(label: str, given: Iterable[str], base: Scenario) -> dict[str, Ran
         fields = tables.get(table)
         if not isinstance(fields, Mapping) or key not in fields:
             raise BadInputError("--range", text, "TABLE.FIELD=LOW:HIGH, a field of scenario files")
-        if name in _NOT_VARIED or not affects(name, method):
+        if table in _SHARED or not affects(name, method):
             raise BadInputError("--range", text, f"a field that affects how {label} drives")
-        ranges[name] = _range(text, limits, fields[key])
+        ranges[name] = _range(text, limits, get_type_hints(type(getattr(base, table)))[key])
     if not ranges:
         raise BadInputError("--range", "", f"at least one range: there are none of {label} itself")
     return ranges
 
 
-def _range(text: str, limits: str, value: Any) -> Range:  # noqa: ANN401 (of any field)
-    """Return the range of a field that has some value now."""
-    if isinstance(value, bool) or not isinstance(value, float | int | None):
+def _range(text: str, limits: str, kind: object) -> Range:
+    """Return the range of a field of some type."""
+    kinds = set(get_args(kind) or (kind,)) - {NoneType}
+    if not kinds <= {int, float}:
         raise BadInputError("--range", text, "a field with one number")
     low_text, _, high_text = limits.partition(":")
     try:
@@ -123,7 +124,7 @@ def _range(text: str, limits: str, value: Any) -> Range:  # noqa: ANN401 (of any
         raise BadInputError("--range", text, "TABLE.FIELD=LOW:HIGH, two numbers") from None
     if not -math.inf < low <= high < math.inf:
         raise BadInputError("--range", text, "TABLE.FIELD=LOW:HIGH with LOW <= HIGH")
-    whole = isinstance(value, int)
+    whole = float not in kinds
     if whole and math.ceil(low) > math.floor(high):
         raise BadInputError("--range", text, "a range with a whole number")
     return Range(low, high, whole)

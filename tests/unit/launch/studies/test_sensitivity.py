@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
@@ -21,7 +22,7 @@ from laneweave.launch.studies.sensitivity import (
 from laneweave.launch.studies.sensitivity_page import draw_tornado, result_row, results_table
 from laneweave.protocol.config.scenario_files import load_scenario, scenario_of
 from laneweave.protocol.scenario.radio_table import C_V2X, DSRC
-from laneweave.protocol.summary import Ending
+from laneweave.protocol.summary import Ending, TripTimes
 from support.commands import Here
 from support.summaries import make_summary
 
@@ -80,6 +81,11 @@ def test_delay_and_loss_are_added_to_those_of_the_radio() -> None:
     assert (lossy.technology, lossy.cellular_loss, lossy.burst_share) == (C_V2X, 0.31, 0.32)
     kept = level("delay", "high", radio__technology=DSRC, radio__cellular_delay_s=2.0)
     assert kept.method.overrides == {"radio.cellular_delay_s": 2.5}
+    worse = level("loss", "high", radio__technology=DSRC, radio__cellular_loss=0.95)
+    assert worse.method.overrides == {"radio.cellular_loss": 0.95, "radio.burst_share": 0.32}
+    assert worse.text == "95 %, and in bursts for 32 % of the time"
+    lost = {"radio__cellular_loss": 0.95, "radio__burst_share": 0.9}
+    assert "loss" not in names("formation", radio__technology=DSRC, **lost)
 
 
 def test_ends_that_are_impossible_are_named() -> None:
@@ -93,13 +99,17 @@ def test_ends_that_are_impossible_are_named() -> None:
 
 def test_results_of_runs() -> None:
     def run_with(
-        mean_s: float | None, ttc_s: float, left: int, ending: Ending = Ending.COMPLETE
+        delays_s: Sequence[float], ttc_s: float, left: int, ending: Ending = Ending.COMPLETE
     ) -> Run:
         made = make_summary()
+        by_entrance = {
+            name: TripTimes(n=n, mean=40.0 + delay_s, delay=delay_s)
+            for name, n, delay_s in zip(("main", "ramp"), (30, 10), delays_s, strict=False)
+        }
         summary = evolve(
             made,
             ending=ending.value,
-            travel_time_s=evolve(made.travel_time_s, mean=mean_s),
+            travel_time_s=evolve(made.travel_time_s, by_entrance=by_entrance),
             safety=evolve(made.safety, min_ttc_s=ttc_s),
             vehicles=evolve(made.vehicles, left=left),
         )
@@ -107,16 +117,17 @@ def test_results_of_runs() -> None:
         return Run(Path("x"), "base", "formation", BASE, summary, reason)
 
     runs = [
-        run_with(70.0, 3.1, 100),
-        run_with(72.0, 2.9, 100),
-        run_with(90.0, 3.3, 98, Ending.LIMIT),
+        run_with((3.0, 7.0), 3.1, 100),
+        run_with((6.0,), 2.9, 100),
+        run_with((), 3.0, 100),
+        run_with((20.0,), 3.3, 98, Ending.LIMIT),
         Run(Path("x"), "base", "formation", BASE, None, "its process was ended by SIGKILL"),
     ]
     found = result_of(runs)
-    assert (found.runs, found.failed) == (4, 2)
-    assert result_row("N", "4", found)[-2:] == ("2", "4, 2 failed")
-    assert found.delay_s == pytest.approx(71.0 - 1000.0 / 15.0)
-    assert found.delays_s == pytest.approx((70.0 - 1000.0 / 15.0, 72.0 - 1000.0 / 15.0))
+    assert (found.runs, found.failed) == (5, 2)
+    assert result_row("N", "4", found)[-2:] == ("2", "5, 2 failed")
+    assert found.delay_s == pytest.approx(5.0)
+    assert found.delays_s == pytest.approx((4.0, 6.0))
     assert (found.min_ttc_s, found.not_left, found.co2_g_per_km) == (2.9, 2, None)
     assert result_of([]) == Result(0, None, (), None, None, None, None, 0, 0)
 

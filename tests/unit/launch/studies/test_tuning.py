@@ -96,6 +96,21 @@ def test_ranges_that_are_given_replace_or_add() -> None:
 
 
 @pytest.mark.parametrize(
+    ("field", "whole"),
+    [
+        ("tracking.horizon_ticks=70:100", True),
+        ("formation.weight_oblique=1:2", True),
+        ("formation.cycle_s=5:7", False),
+        ("formation.gap_m=14:16", False),
+    ],
+)
+def test_fields_without_a_value_have_ranges_of_their_type(field: str, *, whole: bool) -> None:
+    (found,) = ranges_of("formation", (field,), BASE).values()
+    assert found.whole == whole
+    assert len(draw_sets("formation", {field.partition("=")[0]: found}, BASE, 5)) == 5
+
+
+@pytest.mark.parametrize(
     ("method", "range_", "problem"),
     [
         ("formation", (), "at least one range"),
@@ -109,6 +124,10 @@ def test_ranges_that_are_given_replace_or_add() -> None:
         ("lc2013", ("seed=1:2",), "a field of scenario files"),
         ("lc2013", ("lattice.pitch_m=1:2",), "a field of scenario files"),
         ("lc2013", ("road.length_m=1:2",), "a field of scenario files"),
+        ("lc2013", ("road.s3_m=300:900",), "affects how lc2013 drives"),
+        ("formation", ("road.lanes=2:4",), "affects how formation drives"),
+        ("formation", ("demand.min_headway_s=0.5:2",), "affects how formation drives"),
+        ("formation", ("sensing.gap_noise_m=0:1",), "affects how formation drives"),
         ("lc2013", ("demand.duration_s=100:200",), "affects how lc2013 drives"),
         ("lc2013", ("demand.volume_veh_per_lane_h=800:900",), "affects how lc2013 drives"),
         ("lc2013", ("formation.max_columns=1:3",), "affects how lc2013 drives"),
@@ -128,8 +147,8 @@ def test_a_budget_that_is_refused(budget: int) -> None:
 
 
 def test_ranges_without_an_allowed_set_are_refused_with_the_reason() -> None:
-    with pytest.raises(BadInputError, match=r"got 'road.s3_m=1:2'.*\(road\.s3_m"):
-        draw_sets("formation", ranges_of("formation", ("road.s3_m=1:2",), BASE), BASE, 2)
+    with pytest.raises(BadInputError, match=r"got 'formation.gap_m=1:2'.*\(formation\.gap_m"):
+        draw_sets("formation", ranges_of("formation", ("formation.gap_m=1:2",), BASE), BASE, 2)
 
 
 def test_scores() -> None:
