@@ -20,6 +20,7 @@ from commonroad.scenario.trajectory import Trajectory
 from lxml import etree
 
 from laneweave.launch.export.recording import Recording
+from laneweave.launch.export.road_parts import RoadPart, road_parts
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.files import write_atomically
 from laneweave.protocol.scenario.fields import Scenario as Road
@@ -75,34 +76,42 @@ def write_commonroad(recording: Recording, path: Path) -> list[Path]:
 
 
 def _lanelets(road: Road) -> LaneletNetwork:
-    """Return one lanelet for each lane, from its beginning to its end."""
-    lanes, width_m, length_m = road.road.lanes, road.road.lane_width_m, road.road.length_m
+    """Return one lanelet for each part of a lane."""
+    parts, width_m = road_parts(road), road.road.lane_width_m
+    following: dict[int | None, int] = {part.behind: part.number for part in parts}
 
-    def line(lane: float) -> np.ndarray:
-        return np.array([[0.0, lane * width_m], [length_m, lane * width_m]])
+    def line(part: RoadPart, border: float) -> np.ndarray:
+        return np.array([[part.from_m, border * width_m], [part.to_m, border * width_m]])
 
-    return LaneletNetwork.create_from_lanelet_list(
-        [
-            Lanelet(
-                line(lane + 1.0),
-                line(lane + 0.5),
-                line(float(lane)),
-                lanelet_id=lane + 1,
-                adjacent_left=lane + 2 if lane + 1 < lanes else None,
-                adjacent_left_same_direction=True if lane + 1 < lanes else None,
-                adjacent_right=lane or None,
-                adjacent_right_same_direction=True if lane else None,
-                line_marking_left_vertices=_marking(inner=lane + 1 < lanes),
-                line_marking_right_vertices=_marking(inner=lane > 0),
-                lanelet_type={LaneletType.HIGHWAY},
-            )
-            for lane in range(lanes)
-        ]
-    )
+    def lanelet(part: RoadPart) -> Lanelet:
+        (right, left), (to_right, to_left) = map(_identifier, part.beside), part.may_change
+        behind, ahead = _identifier(part.behind), _identifier(following.get(part.number))
+        return Lanelet(
+            line(part, part.lane + 1.0),
+            line(part, part.lane + 0.5),
+            line(part, part.lane),
+            lanelet_id=_identifier(part.number),
+            predecessor=[] if behind is None else [behind],
+            successor=[] if ahead is None else [ahead],
+            adjacent_left=left,
+            adjacent_left_same_direction=None if left is None else True,
+            adjacent_right=right,
+            adjacent_right_same_direction=None if right is None else True,
+            line_marking_left_vertices=_marking(dashed=to_left),
+            line_marking_right_vertices=_marking(dashed=to_right),
+            lanelet_type={LaneletType.HIGHWAY},
+        )
+
+    return LaneletNetwork.create_from_lanelet_list([lanelet(part) for part in parts])
 
 
-def _marking(*, inner: bool) -> LineMarking:
-    return LineMarking.DASHED if inner else LineMarking.SOLID
+def _identifier(part: int | None) -> int | None:
+    """Return the number of a lanelet, which begins at 1."""
+    return None if part is None else part + 1
+
+
+def _marking(*, dashed: bool) -> LineMarking:
+    return LineMarking.DASHED if dashed else LineMarking.SOLID
 
 
 def _obstacle(

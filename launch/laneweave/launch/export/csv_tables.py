@@ -9,7 +9,7 @@ import pyarrow.csv as csv
 import pyarrow.parquet as pq
 
 from laneweave.launch.export.recording import trajectories_within, within
-from laneweave.launch.recordings.runs import unreadable
+from laneweave.launch.recordings.files import reading
 from laneweave.protocol.files import write_atomically
 from laneweave.sim_bridge.recording.columns import TICKS, TRAJECTORIES, TRIPS
 
@@ -33,10 +33,8 @@ def write_csv(run: Path, folder: Path, from_s: float | None, to_s: float | None)
     for name, declared in (("trips", TRIPS), ("ticks", TICKS)):
         file = run / f"{name}.parquet"
         if file.is_file():
-            try:
+            with reading(run, file.name):
                 table = pq.read_table(file)
-            except (OSError, ValueError) as error:
-                raise unreadable(run, file.name, error) from error
             tables[name] = (declared, table if declared is TRIPS else within(table, from_s, to_s))
     folder.mkdir(parents=True, exist_ok=True)
     files = [_write(table, folder / f"{name}.csv") for name, (_, table) in tables.items()]

@@ -11,7 +11,6 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 
 from laneweave.launch.export.recording import Recording
-from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.files import write_atomically
 from laneweave.protocol.runtime.temporary_folders import temporary_folder
 from laneweave.sim_bridge.sumo.network import NETWORK_FILE, write_network
@@ -29,10 +28,10 @@ def write_fcd(recording: Recording, path: Path) -> list[Path]:
 
     Args:
         recording: the run.
-        path: the file; compressed if its name ends with `.gz`. The network is beside it.
+        path: the file; compressed if its name ends with `.gz`. The network is beside it: for
+            `FCD_FILE` `NETWORK_FILE`, for another name `NAME.net.xml`.
 
     Raises:
-        BadInputError: the file has the name of the network.
         OSError: a file cannot be written.
     """
 
@@ -44,9 +43,8 @@ def write_fcd(recording: Recording, path: Path) -> list[Path]:
             with part.open("w", encoding="utf-8") as file:
                 file.writelines(_lines(recording))
 
-    network = path.parent / NETWORK_FILE
-    if path.name == NETWORK_FILE:
-        raise BadInputError("--out", str(path), f"a name other than {NETWORK_FILE}, the network's")
+    name = path.name.removesuffix(".gz").removesuffix(".xml")
+    network = path.with_name(NETWORK_FILE if path.name == FCD_FILE else f"{name}.net.xml")
     write_atomically(path, write)
     with temporary_folder("export") as folder:
         write_network(recording.scenario, folder, sumo_drives=False)

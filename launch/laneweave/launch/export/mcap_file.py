@@ -11,11 +11,12 @@ Times are road times; x is along the road, y to the left from its right edge (fr
 
 from __future__ import annotations
 
+import io
 import json
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, BinaryIO, Final, cast
 
 import foxglove
 import numpy as np
@@ -41,8 +42,9 @@ from foxglove.messages import (
 
 from laneweave.launch.drawing.colours import NEUTRAL, lane_colours
 from laneweave.launch.export.recording import Recording
+from laneweave.launch.export.road_parts import road_parts
+from laneweave.launch.recordings.files import EVENTS, reading
 from laneweave.launch.recordings.formations import read_events
-from laneweave.launch.recordings.runs import unreadable
 from laneweave.protocol.files import write_atomically
 
 MCAP_FILE: Final = "run.mcap"
@@ -82,26 +84,63 @@ def write_mcap(
         OSError: the file cannot be written.
     """
     first_s, last_s = -math.inf if from_s is None else from_s, math.inf if to_s is None else to_s
-    try:
+    with reading(recording.folder, EVENTS):
         events = [
             one for one in read_events(recording.folder) if first_s <= float(one["t_s"]) <= last_s
         ]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise unreadable(recording.folder, "events.jsonl", error) from error
 
     def write(part: Path) -> None:
-        try:
-            _write(recording, events, part)
-        except RuntimeError as error:  # of the library, also if the disk is full
-            raise OSError(str(error)) from error
+        with part.open("wb", buffering=0) as file:
+            _write(recording, events, _Sink(file))
 
     write_atomically(path, write)
     return [path]
 
 
-def _write(recording: Recording, events: Sequence[Mapping[str, Any]], path: Path) -> None:
+class _Sink(io.RawIOBase):
+    """A file that keeps its first error, and takes all bytes after it.
+
+    If it raised the error, the library would print a line for each message, and hide the error.
+    """
+
+    def __init__(self, file: io.RawIOBase) -> None:
+        """Write to an open file from its beginning on."""
+        self._file = file
+        self._error: OSError | None = None
+        self._position = self._end = 0
+
+    def check(self) -> None:
+        """Raise the error, if there was one."""
+        if self._error is not None:
+            raise self._error
+
+    def write(self, data: Any) -> int:  # noqa: ANN401 (any buffer)
+        """Write all bytes, unless there was an error; return their number."""
+        rest = memoryview(data)
+        self._position += len(rest)
+        self._end = max(self._end, self._position)
+        try:
+            while rest and self._error is None:
+                rest = rest[self._file.write(rest) or 0 :]
+        except OSError as error:
+            self._error = error
+        return len(data)
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
+        """Go to a position; return it."""
+        from_byte = {io.SEEK_SET: 0, io.SEEK_CUR: self._position, io.SEEK_END: self._end}
+        self._position = from_byte[whence] + offset
+        if self._error is None:
+            self._file.seek(self._position)
+        return self._position
+
+    def flush(self) -> None:
+        """Do nothing: the file has no buffer."""
+
+
+def _write(recording: Recording, events: Sequence[Mapping[str, Any]], sink: _Sink) -> None:
     context = foxglove.Context()
-    with foxglove.open_mcap(path, allow_overwrite=True, context=context):
+    with foxglove.open_mcap(cast("BinaryIO", sink), context=context):
         begin_s = float(min([recording.t_s[0], *(float(event["t_s"]) for event in events)]))
         road = SceneUpdateChannel("/road", context=context)
         road.log(_road(recording, begin_s), log_time=_ns(begin_s))
@@ -117,6 +156,7 @@ def _write(recording: Recording, events: Sequence[Mapping[str, Any]], path: Path
         traffic = foxglove.Channel("/traffic", schema=_TRAFFIC, context=context)
         colours, sizes = _colours(recording), _sizes(recording)
         for t_s, rows in recording.ticks():
+            sink.check()
             own = slice(rows.start, rows.stop)
             vehicles.log(_bodies(recording, t_s, own, colours, sizes), log_time=_ns(t_s))
             speeds.log(_speeds(recording, t_s, own), log_time=_ns(t_s))
@@ -129,6 +169,7 @@ def _write(recording: Recording, events: Sequence[Mapping[str, Any]], path: Path
                 },
                 log_time=_ns(t_s),
             )
+    sink.check()
 
 
 def _ns(t_s: float) -> int:
@@ -160,20 +201,23 @@ def _sizes(recording: Recording) -> list[Vector3]:
 
 
 def _road(recording: Recording, t_s: float) -> SceneUpdate:
-    road, white = recording.scenario.road, Color(r=1.0, g=1.0, b=1.0, a=1.0)
-    borders = [
+    width_m, white = recording.scenario.road.lane_width_m, Color(r=1.0, g=1.0, b=1.0, a=1.0)
+    borders = {
+        (border, part.from_m, part.to_m)
+        for part in road_parts(recording.scenario)
+        for border in (part.lane, part.lane + 1)
+    }
+    lines = [
         LinePrimitive(
             type=LinePrimitiveLineType.LineStrip,
             pose=_ORIGIN,
             thickness=0.15,
             color=white,
-            points=[
-                Point3(x=x_m, y=border * road.lane_width_m, z=0.0) for x_m in (0.0, road.length_m)
-            ],
+            points=[Point3(x=x_m, y=border * width_m, z=0.0) for x_m in (from_m, to_m)],
         )
-        for border in range(road.lanes + 1)
+        for border, from_m, to_m in sorted(borders)
     ]
-    entity = SceneEntity(timestamp=_timestamp(t_s), frame_id=FRAME, id="road", lines=borders)
+    entity = SceneEntity(timestamp=_timestamp(t_s), frame_id=FRAME, id="road", lines=lines)
     return SceneUpdate(entities=[entity])
 
 

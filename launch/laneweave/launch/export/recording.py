@@ -13,7 +13,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from attrs import frozen
 
-from laneweave.launch.recordings.runs import single_run, unreadable
+from laneweave.launch.recordings.runs import single_run
 from laneweave.launch.recordings.trajectories import Floats, Ints, read_trajectories, read_trips
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.road_layout import ANY_LANE
@@ -100,10 +100,7 @@ class Recording:
             raise BadInputError("RUN", str(folder), "a run with vehicles on the road")
         codes = table["vehicle"].combine_chunks().dictionary_encode()
         names = tuple(str(name) for name in codes.dictionary)
-        try:
-            recorded = read_trips(folder)
-        except (OSError, ValueError, KeyError) as error:
-            raise unreadable(folder, "trips.parquet", error) from error
+        recorded = read_trips(folder)
         trips = [recorded.get(name, {}) for name in names]
         found = {name: np.nan_to_num(table[name].to_numpy()).astype(float) for name in _COLUMNS}
         ahead_mps = np.maximum(found["speed_mps"], 0.0)

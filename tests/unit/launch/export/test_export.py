@@ -20,7 +20,9 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 import sumo
+from attrs import evolve
 from commonroad.common.file_reader import CommonRoadFileReader
+from commonroad.scenario.lanelet import LineMarking
 from commonroad_dc import pycrcc
 from commonroad_dc.collision.collision_detection.pycrcc_collision_dispatch import (
     create_collision_object,
@@ -36,6 +38,7 @@ from laneweave.launch.export.recording import Recording
 from laneweave.launch.run.simulated_run import SimulatedRun
 from laneweave.protocol.config.scenario_files import load_scenario
 from laneweave.protocol.errors import BadInputError, CommandFailedError
+from laneweave.protocol.scenario.road_tables import Closure
 from laneweave.sim_bridge.recording.columns import TRAJECTORIES, TRIPS
 from support.commands import Here
 from support.sharing import made_once
@@ -63,9 +66,10 @@ def test_fcd_has_every_vehicle_at_every_tick(
     run: Path, rows: list[dict[str, Any]], tmp_path: Path
 ) -> None:
     plain, network = export(run, Format.fcd, tmp_path / "fcd.xml")
-    (packed, _) = export(run, Format.fcd, tmp_path / "packed.xml.gz")
+    (packed, beside) = export(run, Format.fcd, tmp_path / "packed.xml.gz")
     assert gzip.decompress(packed.read_bytes()) == plain.read_bytes()
-    assert network.name == "road.net.xml"
+    assert (network.name, beside.name) == ("road.net.xml", "packed.net.xml")
+    assert network.read_bytes() == beside.read_bytes()
     trips = {one["vehicle"]: one for one in pq.read_table(run / "trips.parquet").to_pylist()}
     found = [
         (float(tick.attrib["time"]), vehicle.attrib)
@@ -199,14 +203,37 @@ def test_commonroad_finds_no_collision_and_a_planted_one(run: Path, tmp_path: Pa
     assert np.count_nonzero(planted & first) == np.count_nonzero(planted & second) == 10
     recording.s_m[planted & second] = recording.s_m[planted & first] - 3.0
     recording.y_m[planted & second] = recording.y_m[planted & first]
-    write_commonroad(Recording(**_fields(recording)), tmp_path / "planted.xml")
+    write_commonroad(evolve(recording), tmp_path / "planted.xml")  # without its computed values
     names = recording.names[0], recording.names[1]
     assert (numbers[names[0]], numbers[names[1]]) in colliding(tmp_path / "planted.xml")
 
 
-def _fields(recording: Recording) -> dict[str, Any]:
-    """Return the fields of a recording, without what was computed from them."""
-    return {one.name: getattr(recording, one.name) for one in Recording.__attrs_attrs__}
+def test_closed_parts_are_no_lanelets(run: Path, tmp_path: Path) -> None:
+    recording = Recording.read(run)
+    scenario = recording.scenario
+    closures = (Closure(0, 600.0, 700.0), Closure(2, 0.0, 100.0))
+    road = evolve(scenario.road, closures=closures)
+    write_commonroad(evolve(recording, scenario=evolve(scenario, road=road)), tmp_path / "x.xml")
+    network = CommonRoadFileReader(str(tmp_path / "x.xml")).open()[0].lanelet_network
+    for s_m in (50.0, 150.0, 550.0, 650.0, 750.0):
+        positions = [np.array([s_m, (lane + 0.5) * road.lane_width_m]) for lane in range(3)]
+        found = network.find_lanelet_by_position(positions)
+        closed = {one.lane for one in closures if one.from_m <= s_m < one.to_m}
+        assert [len(one) for one in found] == [lane not in closed for lane in range(3)]
+    (begin,), (beyond,) = network.find_lanelet_by_position(
+        [np.array([s_m, 1.5 * road.lane_width_m]) for s_m in (50.0, 650.0)]
+    )
+    ahead = network.find_lanelet_by_id(begin)
+    assert (ahead.adj_left, ahead.predecessor) == (None, [])
+    while ahead.successor:
+        (following,) = ahead.successor
+        assert network.find_lanelet_by_id(following).predecessor == [ahead.lanelet_id]
+        ahead = network.find_lanelet_by_id(following)
+    assert ahead.center_vertices[-1, 0] == road.length_m
+    beside = network.find_lanelet_by_id(beyond)
+    assert beside.adj_right is None
+    assert beside.line_marking_right_vertices is LineMarking.SOLID
+    assert beside.line_marking_left_vertices is LineMarking.DASHED
 
 
 def colliding(path: Path) -> set[tuple[int, int]]:
@@ -258,7 +285,7 @@ def test_files_have_the_suffix_of_their_format(
 
 
 def test_what_is_not_a_run_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(BadInputError, match="DIR"):
+    with pytest.raises(BadInputError, match="folder"):
         export(tmp_path, Format.csv)
     assert not list(tmp_path.iterdir())
 
@@ -271,14 +298,12 @@ def test_a_folder_that_cannot_be_written(run: Path, tmp_path: Path) -> None:
     for name in ("file", "tables.csv"):
         with pytest.raises(BadInputError, match=r"--out: .* allowed: a folder"):
             export(run, Format.csv, tmp_path / name)
-    with pytest.raises(BadInputError, match="other than road"):
-        export(run, Format.fcd, tmp_path / "road.net.xml")
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
 @pytest.mark.parametrize("chosen", Format)
 def test_on_a_full_disk_the_command_fails_in_one_line(
-    run: Path, chosen: Format, tmp_path: Path
+    run: Path, chosen: Format, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     """A limit on the size of files stands for the disk; nothing is left of what did not fit."""
     out = {"csv": ".", "fcd": "x.xml", "mcap": "x.mcap", "commonroad": "x.xml"}[chosen]
@@ -286,11 +311,13 @@ def test_on_a_full_disk_the_command_fails_in_one_line(
     handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, before[1]))
     try:
-        with pytest.raises(CommandFailedError):
+        with pytest.raises(CommandFailedError) as failed:
             export(run, chosen, tmp_path / out)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
         signal.signal(signal.SIGXFSZ, handler)
+    assert "File too large" in str(failed.value) or chosen is Format.commonroad
+    assert capfd.readouterr() == ("", "")
     assert not list(tmp_path.iterdir())
 
 
