@@ -13,7 +13,9 @@ from evaluation.points import PointRow
 from evaluation.programme import FORMATIONS, LABELS, TUNED_FIGURES, VOLUMES, planned
 
 OWN: Final = ("formations", "rolling")
-"""Labels that are compared: the two operations with their default settings."""
+"""Labels that are compared with all references: the two operations with their default settings."""
+COMPARED: Final = (*OWN, *(label for label in FORMATIONS if label not in OWN))
+"""Labels whose travel times are compared."""
 OPPONENTS: Final = tuple(label for label in LABELS if label not in FORMATIONS)
 TUNED: Final = ("lc2013-tuned", "sl2015-tuned")
 """Drivers with the best sets that `laneweave tune` has found for this road."""
@@ -35,7 +37,7 @@ _COMPARED_WORDS: Final = {
 
 def comparison(evidence: Evidence) -> str:
     """Return tables of differences of travel times, and a sentence for each volume."""
-    return "\n\n".join(_of_one(evidence, label) for label in OWN)
+    return "\n\n".join(_of_one(evidence, label) for label in COMPARED)
 
 
 def _of_one(evidence: Evidence, label: str) -> str:

@@ -196,19 +196,28 @@ class _Judge:
         text = "Formation control is faster than the rules at these volumes"
         parts: list[str] = []
         kept: list[bool | None] = []
+        too_few: set[float] = set()
+        even: list[str] = []
         for label in INTERPRETATIONS:
             found = [
                 difference_of(self.evidence, OWN, label, volume, "travel_s")
                 for volume in PAPER_VOLUMES
             ]
             verdicts = [one.verdict if one is not None else Verdict.UNKNOWN for one in found]
+            for volume, verdict in zip(PAPER_VOLUMES, verdicts, strict=True):
+                if verdict is Verdict.UNKNOWN:
+                    too_few.add(volume)
+                elif verdict is Verdict.NONE:
+                    even.append(f"not different from `{label}` at {volume:g}")
             texts = ["-" if one is None else f"{one.mean:+.1f}" for one in found]
             known = [one for one in found if one is not None]
             parts.append(f"`{OWN}` minus `{label}` {_series(texts, known)}")
             shown = all(one is Verdict.LESS for one in verdicts)
             kept.append(False if Verdict.MORE in verdicts else shown or None)
-        if None in kept:
-            parts.append(f"not judged: fewer than {MIN_SEEDS} seeds, or an interval contains 0")
+        if too_few:
+            where = ", ".join(f"{volume:g}" for volume in sorted(too_few))
+            parts.append(f"not judged: fewer than {MIN_SEEDS} common seeds at {where}")
+        parts += even
         return Statement(text, "; ".join(parts), _some(kept))
 
     def _alike_below(self) -> Statement:
