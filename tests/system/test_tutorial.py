@@ -104,7 +104,7 @@ def test_the_guide_of_exports(lab: Lab, clone: Path) -> None:
     ]  # fmt: skip
     assert (clone / "time-space.png").stat().st_size > 10_000
     found = {path.name for path in (clone / "runs" / "analysed" / "export").iterdir()}
-    assert {"fcd.xml", "road.net.xml", "run.mcap", "commonroad.xml", "columns.csv"} <= found
+    assert {"fcd.xml", "fcd.road.net.xml", "run.mcap", "commonroad.xml", "columns.csv"} <= found
 
 
 @pytest.mark.slow

@@ -28,7 +28,7 @@ from laneweave.protocol.wire.messages import CAR
 
 COMMONROAD_FILE: Final = "commonroad.xml"
 FIRST_OBSTACLE: Final = 1000
-"""Number of the first vehicle; lanelets have smaller numbers."""
+"""Number of the first vehicle, or the next multiple of it: lanelets have smaller numbers."""
 
 
 def write_commonroad(recording: Recording, path: Path) -> list[Path]:
@@ -44,14 +44,16 @@ def write_commonroad(recording: Recording, path: Path) -> list[Path]:
     """
     tick_s = recording.scenario.runtime.tick_s
     scenario = Scenario(tick_s, ScenarioID(country_id="ZAM", map_name="Laneweave", map_id=1))
-    scenario.add_objects(_lanelets(recording.scenario))
+    lanelets = _lanelets(recording.scenario)
+    scenario.add_objects(lanelets)
+    first = FIRST_OBSTACLE * (1 + len(lanelets.lanelets) // FIRST_OBSTACLE)
     order = np.argsort(recording.vehicle, kind="stable")
     bounds = np.searchsorted(recording.vehicle[order], np.arange(len(recording.names) + 1))
     steps = np.rint((recording.t_s - recording.t_s[0]) / tick_s).astype(np.int64)
     for number in range(len(recording.names)):
         rows = order[bounds[number] : bounds[number + 1]]
         if len(rows) > 1:
-            scenario.add_objects(_obstacle(recording, number, rows, steps))
+            scenario.add_objects(_obstacle(recording, number, first + number, rows, steps))
     if not scenario.dynamic_obstacles:
         raise BadInputError("--from, --to", "one tick", "at least two ticks")
     writer = CommonRoadFileWriter(
@@ -84,7 +86,7 @@ def _lanelets(road: Road) -> LaneletNetwork:
         return np.array([[part.from_m, border * width_m], [part.to_m, border * width_m]])
 
     def lanelet(part: RoadPart) -> Lanelet:
-        (right, left), (to_right, to_left) = map(_identifier, part.beside), part.may_change
+        (right, left), (to_right, to_left) = map(_identifier, part.beside), part.may_cross
         behind, ahead = _identifier(part.behind), _identifier(following.get(part.number))
         return Lanelet(
             line(part, part.lane + 1.0),
@@ -115,7 +117,7 @@ def _marking(*, dashed: bool) -> LineMarking:
 
 
 def _obstacle(
-    recording: Recording, number: int, rows: np.ndarray, steps: np.ndarray
+    recording: Recording, number: int, identifier: int, rows: np.ndarray, steps: np.ndarray
 ) -> DynamicObstacle:
     """Return a vehicle with its trajectory."""
     shape = Rectangle(*recording.size_m(number))
@@ -135,4 +137,4 @@ def _obstacle(
     kind = ObstacleType.CAR if recording.types[number] == CAR else ObstacleType.TRUCK
     trajectory = Trajectory(later[0].time_step, later)
     prediction = TrajectoryPrediction(trajectory, shape)
-    return DynamicObstacle(FIRST_OBSTACLE + number, kind, shape, initial, prediction)
+    return DynamicObstacle(identifier, kind, shape, initial, prediction)

@@ -28,8 +28,8 @@ def write_fcd(recording: Recording, path: Path) -> list[Path]:
 
     Args:
         recording: the run.
-        path: the file; compressed if its name ends with `.gz`. The network is beside it: for
-            `FCD_FILE` `NETWORK_FILE`, for another name `NAME.net.xml`.
+        path: the file, `NAME.xml` or, compressed, `NAME.xml.gz`. The network is beside it:
+            `NAME.road.net.xml`.
 
     Raises:
         OSError: a file cannot be written.
@@ -44,7 +44,7 @@ def write_fcd(recording: Recording, path: Path) -> list[Path]:
                 file.writelines(_lines(recording))
 
     name = path.name.removesuffix(".gz").removesuffix(".xml")
-    network = path.with_name(NETWORK_FILE if path.name == FCD_FILE else f"{name}.net.xml")
+    network = path.with_name(f"{name}.{NETWORK_FILE}")
     write_atomically(path, write)
     with temporary_folder("export") as folder:
         write_network(recording.scenario, folder, sumo_drives=False)

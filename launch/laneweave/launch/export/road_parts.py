@@ -22,16 +22,17 @@ class RoadPart:
     behind: int | None
     """Number of the part that leads to it; None: the lane begins."""
     beside: tuple[int | None, int | None]
-    """Numbers of the parts to its right and to its left; None: none, or a ramp begins or leads
-    there, which is separate from the road."""
-    may_change: tuple[bool, bool]
-    """Whether vehicles of all types may change lanes to the right, and to the left."""
+    """Numbers of the parts to its right and to its left; None: there is no lane, or one of both is
+    a ramp that has not joined the road yet."""
+    may_cross: tuple[bool, bool]
+    """Whether vehicles of all types may cross the line to the right, and to the left; restrictions
+    of lanes do not count."""
 
 
 def road_parts(scenario: Scenario) -> tuple[RoadPart, ...]:
     """Return the parts of all lanes, in the direction of travel, those of the right lane first.
 
-    What is closed for a time belongs to the road.
+    Parts that are closed for a time count as open.
     """
     sections, end_m = scenario.geometry.sections, scenario.road.length_m
     lines = scenario.road.solid_lines
@@ -53,7 +54,7 @@ def road_parts(scenario: Scenario) -> tuple[RoadPart, ...]:
     def parts() -> Iterator[RoadPart]:
         for (place, lane), section in opened.items():
             from_m, to_m = bounds_m[place]
-            beside, may_change = list[int | None](), list[bool]()
+            beside, may_cross = list[int | None](), list[bool]()
             for side in (-1, 1):
                 other = opened.get((place, lane + side))
                 separate = other is None or _is_ramp(section, from_m) or _is_ramp(other, from_m)
@@ -64,7 +65,7 @@ def road_parts(scenario: Scenario) -> tuple[RoadPart, ...]:
                     and one.from_m <= from_m < one.to_m
                     for one in lines
                 )
-                may_change.append(not separate and not forbidden)
+                may_cross.append(not separate and not forbidden)
             yield RoadPart(
                 number=numbers[place, lane],
                 lane=lane,
@@ -72,7 +73,7 @@ def road_parts(scenario: Scenario) -> tuple[RoadPart, ...]:
                 to_m=to_m,
                 behind=numbers.get((place - 1, lane)),
                 beside=(beside[0], beside[1]),
-                may_change=(may_change[0], may_change[1]),
+                may_cross=(may_cross[0], may_cross[1]),
             )
 
     return tuple(parts())

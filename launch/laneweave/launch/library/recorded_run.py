@@ -75,7 +75,7 @@ class RecordedRun:
         """
         with reading(self.folder, EVENTS), (self.folder / EVENTS).open(encoding="utf-8") as lines:
             events = [json.loads(line) for line in lines]
-            found = [event for event in events if kind in (None, event["kind"])]
+            found = [event for event in events if kind is None or event["kind"] == kind]
         if kind is None:
             return events
         # Plug-ins and other releases have kinds of their own.

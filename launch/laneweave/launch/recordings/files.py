@@ -22,10 +22,10 @@ def not_a_run(folder: Path, why: object) -> BadInputError:
 
 @contextmanager
 def reading(folder: Path, file: str) -> Iterator[None]:
-    """Name the file if it cannot be read, or has not the content of a run's file.
+    """Convert errors while a run's file is read to a `BadInputError` that names it.
 
     Raises:
-        BadInputError: that is so.
+        BadInputError: the file is missing, damaged, or has unexpected content.
     """
     try:
         yield
@@ -33,7 +33,9 @@ def reading(folder: Path, file: str) -> Iterator[None]:
         raise
     except (OSError, ValueError, KeyError, TypeError) as error:
         if (folder / SUMMARY_FILE).is_file() and not (folder / file).exists():
-            kept = "a run that kept this file; trajectories in a sweep: --keep-trajectories all"
+            kept = "a run that kept this file"
+            if file == TRAJECTORIES:
+                kept += "; in a sweep: --keep-trajectories all"
             raise BadInputError(file, f"none in {folder}", kept) from error
         why = getattr(error, "strerror", None) or f"{type(error).__name__}: {error}"
         raise not_a_run(folder, f"{file} cannot be read: {why}") from error

@@ -136,11 +136,19 @@ class Comparison:
 
 
 def scenario_of(path: Path) -> Scenario:
-    """Return the scenario in the metadata of a run's Parquet file; by default `Scenario()`."""
+    """Return the scenario in the metadata of a run's Parquet file; by default `Scenario()`.
+
+    Raises:
+        BadInputError: this release does not understand the scenario.
+        OSError, ValueError: the file cannot be read.
+    """
     metadata = pq.read_schema(path).metadata or {}
     text = metadata.get(SCENARIO_KEY)
     data: dict[str, Any] = json.loads(text) if text else {}
-    return parse_scenario(data)
+    try:
+        return parse_scenario(data)
+    except BadInputError as error:
+        raise not_a_run(path.parent, f"the scenario in {path.name}: {error}") from error
 
 
 def is_sweep(folder: Path) -> bool:

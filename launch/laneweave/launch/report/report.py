@@ -189,9 +189,8 @@ def report_comparison(
         file_format: format of the figures; SVG and PDF are written beside the PNG files.
 
     Raises:
-        BadInputError: the run has no such formation.
-        OSError: a file cannot be read or written.
-        ValueError, KeyError: a folder is not that of a finished run.
+        BadInputError: the run has no such formation, or a file of a run cannot be read.
+        OSError: a file cannot be written.
     """
     out.mkdir(parents=True, exist_ok=True)
     runs = len(comparison.runs)

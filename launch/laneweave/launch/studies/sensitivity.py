@@ -39,7 +39,7 @@ _DELAY_S: Final = 0.5
 _LOSS: Final = 0.3
 """Added to the loss in the cellular network and to the share of time in bursts."""
 _MAX_LOSS: Final = 0.9
-"""Maximum up to which it is added."""
+"""Upper bound of both sums; larger values of the scenario are kept."""
 
 
 @frozen

@@ -102,8 +102,8 @@ def write_sensitivity(
     refused = [reason for factor in factors for reason in factor.refused]
     caption = (
         "Mean delay with one setting changed at a time; lines: range over the seeds. Delay: mean "
-        "travel time beyond that at v_F, the speed of the lattice, in runs in which all vehicles "
-        "left; T_F: time of a step; S3: the "
+        "excess over the time at v_F, the speed of the lattice, from the entrance to the "
+        "destination, in runs in which all vehicles left; T_F: time of a step; S3: the "
         "part of the road in which vehicles change lanes; N: maximum number of vehicles of a "
         "formation."
     )

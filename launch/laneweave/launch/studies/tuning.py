@@ -40,7 +40,7 @@ OTHER_LANE_S: Final = 1.0
 _LOGARITHMIC: Final = 10.0
 """Ranges whose ends have at least this ratio are drawn uniformly in the logarithm."""
 _SHARED: Final = ("road", "demand", "radio", "sensing")
-"""Tables that all sets of a search share: on another road, travel times say nothing about a set."""
+"""Tables that describe the task: equal for all sets, or their results could not be compared."""
 
 
 @frozen
@@ -104,7 +104,11 @@ def ranges_of(label: str, given: Iterable[str], base: Scenario) -> dict[str, Ran
         fields = tables.get(table)
         if not isinstance(fields, Mapping) or key not in fields:
             raise BadInputError("--range", text, "TABLE.FIELD=LOW:HIGH, a field of scenario files")
-        if table in _SHARED or not affects(name, method):
+        if table in _SHARED:
+            raise BadInputError(
+                "--range", text, f"no field of {', '.join(_SHARED)}: all sets share it"
+            )
+        if not affects(name, method):
             raise BadInputError("--range", text, f"a field that affects how {label} drives")
         ranges[name] = _range(text, limits, get_type_hints(type(getattr(base, table)))[key])
     if not ranges:

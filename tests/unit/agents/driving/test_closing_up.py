@@ -10,6 +10,7 @@ import pytest
 from laneweave.agents.driving.move_bounds import TRACKING_ERROR_M, Envelope
 from laneweave.agents.driving.qp_solver import SOLVED, QPResult, QuadraticProgram
 from laneweave.agents.driving.trajectory import (
+    InfeasibleTrajectoryError,
     Trajectory,
     check_moves,
     move_profile,
@@ -157,16 +158,33 @@ def test_moves_keep_what_the_limits_allow() -> None:
 
 
 @pytest.mark.parametrize(
-    ("gap_m", "max_accel_mps2"),
+    ("gap_m", "limits"),
     [
-        *((9.0, 5.0), (10.0, 3.5), (10.0, 5.0), (11.0, 5.0), (12.0, 3.5), (12.0, 5.0), (13.0, 5.0)),
-        *((15.0, 5.0), (15.0, 3.0), (20.0, 5.0), (25.0, 5.0)),
+        *((gap_m, {}) for gap_m in (9.0, 10.0, 11.0, 12.0, 13.0, 14.0, 15.0, 20.0, 25.0)),
+        *((gap_m, {"max_accel_mps2": 3.5}) for gap_m in (10.0, 12.0)),
+        *((gap_m, {"max_accel_mps2": 8.0}) for gap_m in (15.0, 18.0, 20.0)),
+        *((gap_m, {"max_jerk_mps3": 10.0}) for gap_m in (14.0, 15.0)),
+        (15.0, {"max_accel_mps2": 3.0}),
+        (15.0, {"max_accel_mps2": 8.0, "length_m": 3.0}),
+        (15.0, {"length_m": 7.0}),
     ],
 )
-def test_the_shortest_slots_with_gentle_moves(gap_m: float, max_accel_mps2: float) -> None:
-    tables = {"formation": {"gap_m": gap_m}, "vehicle": {"max_accel_mps2": max_accel_mps2}}
-    tables["formation"]["cycle_s"] = parse_scenario(tables).timing.gentle_cycle_s
-    assert min_ttc_s(parse_scenario(tables), 1) >= MIN_TTC_S - 0.01
+def test_slots_from_which_moves_are_gentle(gap_m: float, limits: dict[str, float]) -> None:
+    def are_gentle(cycle_s: float) -> bool:
+        formation = {"gap_m": gap_m, "cycle_s": cycle_s}
+        scenario = parse_scenario({"formation": formation, "vehicle": limits})
+        try:
+            return all(min_ttc_s(scenario, dx) >= MIN_TTC_S - 0.01 for dx in (1, -1))
+        except InfeasibleTrajectoryError:
+            return False
+
+    found = parse_scenario({"formation": {"gap_m": gap_m}, "vehicle": limits}).timing
+    assert are_gentle(found.gentle_cycle_s)
+    shorter_s = found.gentle_cycle_s - 1.4
+    assert shorter_s < found.slots_s[0] or not are_gentle(shorter_s)
+
+
+def test_the_slots_of_the_default_scenario() -> None:
     timing = SCENARIO.timing
     slots_s = (timing.gentle_cycle_s, timing.brisk_cycle_s, timing.comfortable_cycle_s)
     assert slots_s == pytest.approx((4.6, 5.2, 5.6))

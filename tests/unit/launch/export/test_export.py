@@ -38,7 +38,7 @@ from laneweave.launch.export.recording import Recording
 from laneweave.launch.run.simulated_run import SimulatedRun
 from laneweave.protocol.config.scenario_files import load_scenario
 from laneweave.protocol.errors import BadInputError, CommandFailedError
-from laneweave.protocol.scenario.road_tables import Closure
+from laneweave.protocol.scenario.road_tables import Closure, SolidLine
 from laneweave.sim_bridge.recording.columns import TRAJECTORIES, TRIPS
 from support.commands import Here
 from support.sharing import made_once
@@ -68,7 +68,7 @@ def test_fcd_has_every_vehicle_at_every_tick(
     plain, network = export(run, Format.fcd, tmp_path / "fcd.xml")
     (packed, beside) = export(run, Format.fcd, tmp_path / "packed.xml.gz")
     assert gzip.decompress(packed.read_bytes()) == plain.read_bytes()
-    assert (network.name, beside.name) == ("road.net.xml", "packed.net.xml")
+    assert (network.name, beside.name) == ("fcd.road.net.xml", "packed.road.net.xml")
     assert network.read_bytes() == beside.read_bytes()
     trips = {one["vehicle"]: one for one in pq.read_table(run / "trips.parquet").to_pylist()}
     found = [
@@ -234,6 +234,19 @@ def test_closed_parts_are_no_lanelets(run: Path, tmp_path: Path) -> None:
     assert beside.adj_right is None
     assert beside.line_marking_right_vertices is LineMarking.SOLID
     assert beside.line_marking_left_vertices is LineMarking.DASHED
+
+
+def test_roads_of_many_parts_have_numbers_for_all_vehicles(run: Path, tmp_path: Path) -> None:
+    recording = Recording.read(run)
+    lines = tuple(SolidLine(1, "left", 5.0 * n, 5.0 * n + 2.0) for n in range(1, 180))
+    scenario = recording.scenario
+    scenario = evolve(scenario, road=evolve(scenario.road, solid_lines=lines))
+    write_commonroad(evolve(recording, scenario=scenario), tmp_path / "x.xml")
+    found = CommonRoadFileReader(str(tmp_path / "x.xml")).open()[0]
+    assert len(found.lanelet_network.lanelets) > FIRST_OBSTACLE
+    numbers = sorted(one.obstacle_id for one in found.dynamic_obstacles)
+    assert numbers[0] == 2 * FIRST_OBSTACLE
+    assert len(numbers) == len(recording.names)
 
 
 def colliding(path: Path) -> set[tuple[int, int]]:

@@ -34,7 +34,7 @@ def test_parts_are_where_the_road_is_open(name: str) -> None:
             assert (part is not None) == (lane not in closed)
             if part is not None and lane in opened:
                 assert part.beside == (None, None)
-                assert part.may_change == (False, False)
+                assert part.may_cross == (False, False)
     check_neighbours(parts)
 
 
@@ -48,7 +48,7 @@ def check_neighbours(parts: tuple[RoadPart, ...]) -> None:
                 assert (other.from_m, other.to_m) == (part.from_m, part.to_m)
                 assert other.lane == part.lane + (-1, 1)[side]
             else:
-                assert not part.may_change[side]
+                assert not part.may_cross[side]
         if part.behind is not None:
             assert (parts[part.behind].lane, parts[part.behind].to_m) == (part.lane, part.from_m)
 
@@ -72,8 +72,8 @@ def test_vehicles_may_not_cross_solid_lines_of_their_lane() -> None:
         middle, left = part_at(parts, 1, s_m), part_at(parts, 2, s_m)
         assert middle is not None
         assert left is not None
-        assert (middle.may_change[1], left.may_change[0]) == (to_left, to_right)
+        assert (middle.may_cross[1], left.may_cross[0]) == (to_left, to_right)
         assert middle.beside[1] == left.number
     first = part_at(parts, 0, 50.0)
     assert first is not None
-    assert not first.may_change[1]
+    assert not first.may_cross[1]

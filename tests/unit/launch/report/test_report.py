@@ -21,6 +21,7 @@ from laneweave.launch.report.page import Animation, Section, keep_units, render_
 from laneweave.launch.report.report import TOO_SHORT
 from laneweave.launch.report.tables import Table, tables_of
 from laneweave.protocol.scenario.fields import Scenario
+from laneweave.sim_bridge.recording.columns import SCENARIO_KEY
 from support.commands import Here
 from support.summaries import make_summary
 from support.tables import for_each
@@ -219,6 +220,20 @@ def test_one_line_names_the_damaged_file(
     said = laneweave.refused("report", "sweep" if of_sweep else damaged.parent)
     assert str(damaged.parent) in said
     assert file in said
+
+
+def test_a_scenario_of_another_release_is_named_with_its_file(
+    laneweave: Here, swept: Path, tmp_path: Path
+) -> None:
+    folder = tmp_path / "run"
+    shutil.copytree(swept / "formation-1000-1", folder)
+    table = pq.read_table(folder / "trajectories.parquet")
+    metadata = dict(table.schema.metadata)
+    metadata[SCENARIO_KEY] = metadata[SCENARIO_KEY].replace(b'"gap_m"', b'"gap_of_later_m"')
+    pq.write_table(table.replace_schema_metadata(metadata), folder / "trajectories.parquet")
+    said = laneweave.refused("report", folder)
+    assert "the scenario in trajectories.parquet" in said
+    assert "gap_of_later_m" in said
 
 
 def test_an_error_of_the_report_is_not_reported_as_bad_input(
