@@ -13,9 +13,9 @@ from evaluation.points import PointRow
 from evaluation.programme import FORMATIONS, LABELS, TUNED_FIGURES, VOLUMES, planned
 
 OWN: Final = ("formations", "rolling")
-"""Labels that are compared with all references: the two operations with their default settings."""
+"""Labels of the two operations with their default settings."""
 COMPARED: Final = (*OWN, *(label for label in FORMATIONS if label not in OWN))
-"""Labels whose travel times are compared."""
+"""Labels whose travel times are compared with those of the references."""
 OPPONENTS: Final = tuple(label for label in LABELS if label not in FORMATIONS)
 TUNED: Final = ("lc2013-tuned", "sl2015-tuned")
 """Drivers with the best sets that `laneweave tune` has found for this road."""

@@ -15,7 +15,7 @@ from attrs import frozen
 from laneweave.launch.explain.facts import Event, Facts, facts_of
 from laneweave.launch.explain.reasons import reason_of
 from laneweave.launch.explain.story import StoryLine, seconds, story_of, to_dict, wanted
-from laneweave.launch.recordings.files import EVENTS, TRIPS
+from laneweave.launch.recordings.files import EVENTS_FILE, TRIPS_FILE
 from laneweave.launch.recordings.runs import scenario_of
 from laneweave.protocol.errors import BadInputError, unknown_name
 from laneweave.protocol.names import span_of
@@ -109,7 +109,7 @@ def _events(folder: Path) -> Sequence[Event]:
         BadInputError: there are none, or they cannot be read.
     """
     try:
-        lines = (folder / EVENTS).read_text(encoding="utf-8", errors="replace").splitlines()
+        lines = (folder / EVENTS_FILE).read_text(encoding="utf-8", errors="replace").splitlines()
         events = [_parsed(line) for line in lines[:-1]]
         if lines:
             with contextlib.suppress(ValueError):
@@ -117,7 +117,7 @@ def _events(folder: Path) -> Sequence[Event]:
     except (OSError, ValueError) as error:
         why = getattr(error, "strerror", None) or error
         raise BadInputError(
-            "RUN", str(folder), f"the folder of a run, with {EVENTS} ({why})"
+            "RUN", str(folder), f"the folder of a run, with {EVENTS_FILE} ({why})"
         ) from error
     return events
 
@@ -132,7 +132,7 @@ def _parsed(line: str) -> Event:
 def _trips(folder: Path) -> Mapping[str, None]:
     """Return the names of the vehicles that have arrived; none if they are not recorded yet."""
     try:
-        names = pq.read_table(folder / TRIPS, columns=["vehicle"])["vehicle"]
+        names = pq.read_table(folder / TRIPS_FILE, columns=["vehicle"])["vehicle"]
     except (OSError, ValueError):
         return {}
     return dict.fromkeys(map(str, names.to_pylist()))
@@ -141,6 +141,6 @@ def _trips(folder: Path) -> Mapping[str, None]:
 def _scenario(folder: Path) -> Scenario:
     """Return the scenario of a run; the defaults if it is not recorded yet."""
     try:
-        return scenario_of(folder / TRIPS)
+        return scenario_of(folder / TRIPS_FILE)
     except (OSError, ValueError):
         return Scenario()

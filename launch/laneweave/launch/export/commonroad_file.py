@@ -28,7 +28,8 @@ from laneweave.protocol.wire.messages import CAR
 
 COMMONROAD_FILE: Final = "commonroad.xml"
 FIRST_OBSTACLE: Final = 1000
-"""Number of the first vehicle, or the next multiple of it: lanelets have smaller numbers."""
+"""Number of the first vehicle; on roads with more lanelets, a multiple of it: the numbers of
+lanelets are smaller."""
 
 
 def write_commonroad(recording: Recording, path: Path) -> list[Path]:
@@ -86,14 +87,14 @@ def _lanelets(road: Road) -> LaneletNetwork:
         return np.array([[part.from_m, border * width_m], [part.to_m, border * width_m]])
 
     def lanelet(part: RoadPart) -> Lanelet:
-        (right, left), (to_right, to_left) = map(_identifier, part.beside), part.may_cross
-        behind, ahead = _identifier(part.behind), _identifier(following.get(part.number))
+        (right, left), (to_right, to_left) = part.beside, part.may_cross
+        ahead = following.get(part.number)
         return Lanelet(
             line(part, part.lane + 1.0),
             line(part, part.lane + 0.5),
             line(part, part.lane),
-            lanelet_id=_identifier(part.number),
-            predecessor=[] if behind is None else [behind],
+            lanelet_id=part.number,
+            predecessor=[] if part.behind is None else [part.behind],
             successor=[] if ahead is None else [ahead],
             adjacent_left=left,
             adjacent_left_same_direction=None if left is None else True,
@@ -105,11 +106,6 @@ def _lanelets(road: Road) -> LaneletNetwork:
         )
 
     return LaneletNetwork.create_from_lanelet_list([lanelet(part) for part in parts])
-
-
-def _identifier(part: int | None) -> int | None:
-    """Return the number of a lanelet, which begins at 1."""
-    return None if part is None else part + 1
 
 
 def _marking(*, dashed: bool) -> LineMarking:

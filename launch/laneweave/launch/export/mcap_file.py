@@ -43,7 +43,7 @@ from foxglove.messages import (
 from laneweave.launch.drawing.colours import NEUTRAL, lane_colours
 from laneweave.launch.export.recording import Recording
 from laneweave.launch.export.road_parts import road_parts
-from laneweave.launch.recordings.files import EVENTS, reading
+from laneweave.launch.recordings.files import EVENTS_FILE, reading
 from laneweave.launch.recordings.formations import read_events
 from laneweave.protocol.files import write_atomically
 
@@ -84,7 +84,7 @@ def write_mcap(
         OSError: the file cannot be written.
     """
     first_s, last_s = -math.inf if from_s is None else from_s, math.inf if to_s is None else to_s
-    with reading(recording.folder, EVENTS):
+    with reading(recording.folder, EVENTS_FILE):
         events = [
             one for one in read_events(recording.folder) if first_s <= float(one["t_s"]) <= last_s
         ]
@@ -98,7 +98,7 @@ def write_mcap(
 
 
 class _Sink(io.RawIOBase):
-    """A file that keeps its first error, and takes all bytes after it.
+    """A file that keeps its first write error, and discards all later bytes.
 
     If it raised the error, the library would print a line for each message, and hide the error.
     """
@@ -133,9 +133,6 @@ class _Sink(io.RawIOBase):
         if self._error is None:
             self._file.seek(self._position)
         return self._position
-
-    def flush(self) -> None:
-        """Do nothing: the file has no buffer."""
 
 
 def _write(recording: Recording, events: Sequence[Mapping[str, Any]], sink: _Sink) -> None:

@@ -1,13 +1,11 @@
-"""The lanes of a road in parts, as formats for maps need them."""
+"""The lanes of a road, divided into parts for the formats of maps."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from itertools import pairwise
 
 from attrs import frozen
 
-from laneweave.protocol.road_layout import LaneSection
 from laneweave.protocol.scenario.fields import Scenario
 
 
@@ -16,6 +14,7 @@ class RoadPart:
     """A part of an open lane along which its neighbours, and the lines beside it, are the same."""
 
     number: int
+    """Number of the part, from 1."""
     lane: int
     from_m: float
     to_m: float
@@ -36,48 +35,38 @@ def road_parts(scenario: Scenario) -> tuple[RoadPart, ...]:
     """
     sections, end_m = scenario.geometry.sections, scenario.road.length_m
     lines = scenario.road.solid_lines
-    inner_m = {
-        at_m
-        for one in sections
-        for at_m in (one.from_m, one.moves_from_m, one.to_m)
-        if 0.0 < at_m < end_m
-    } | {at_m for one in lines for at_m in (one.from_m, one.to_m) if 0.0 < at_m < end_m}
-    bounds_m = [*pairwise([0.0, *sorted(inner_m), end_m])]
+    changes_m = {at_m for one in sections for at_m in (one.from_m, one.moves_from_m, one.to_m)}
+    changes_m |= {at_m for one in lines for at_m in (one.from_m, one.to_m)}
+    inner_m = sorted(at_m for at_m in changes_m if 0.0 < at_m < end_m)
+    bounds_m = [*pairwise([0.0, *inner_m, end_m])]
     opened = {
         (place, one.lane): one
         for place, (from_m, to_m) in enumerate(bounds_m)
         for one in sorted(sections, key=lambda section: section.lane)
         if one.from_m <= from_m and to_m <= one.to_m
     }
-    numbers = {key: number for number, key in enumerate(opened)}
+    numbers = {key: number for number, key in enumerate(opened, start=1)}
 
-    def parts() -> Iterator[RoadPart]:
-        for (place, lane), section in opened.items():
-            from_m, to_m = bounds_m[place]
-            beside, may_cross = list[int | None](), list[bool]()
-            for side in (-1, 1):
-                other = opened.get((place, lane + side))
-                separate = other is None or _is_ramp(section, from_m) or _is_ramp(other, from_m)
-                beside.append(None if separate else numbers[place, lane + side])
-                forbidden = any(
-                    one.lane == lane
-                    and (one.to == "left") == (side == 1)
-                    and one.from_m <= from_m < one.to_m
-                    for one in lines
-                )
-                may_cross.append(not separate and not forbidden)
-            yield RoadPart(
-                number=numbers[place, lane],
-                lane=lane,
-                from_m=from_m,
-                to_m=to_m,
-                behind=numbers.get((place - 1, lane)),
-                beside=(beside[0], beside[1]),
-                may_cross=(may_cross[0], may_cross[1]),
-            )
+    def beside(place: int, lane: int, side: int) -> int | None:
+        other, from_m = opened.get((place, lane + side)), bounds_m[place][0]
+        if other is None or from_m < max(other.moves_from_m, opened[place, lane].moves_from_m):
+            return None
+        return numbers[place, lane + side]
 
-    return tuple(parts())
+    def may_cross(place: int, lane: int, side: int) -> bool:
+        from_m, change = bounds_m[place][0], (lane, lane + side)
+        forbidden = any(change in one.changes and one.from_m <= from_m < one.to_m for one in lines)
+        return beside(place, lane, side) is not None and not forbidden
 
-
-def _is_ramp(section: LaneSection, s_m: float) -> bool:
-    return s_m < section.moves_from_m
+    return tuple(
+        RoadPart(
+            number=number,
+            lane=lane,
+            from_m=bounds_m[place][0],
+            to_m=bounds_m[place][1],
+            behind=numbers.get((place - 1, lane)),
+            beside=(beside(place, lane, -1), beside(place, lane, 1)),
+            may_cross=(may_cross(place, lane, -1), may_cross(place, lane, 1)),
+        )
+        for (place, lane), number in numbers.items()
+    )

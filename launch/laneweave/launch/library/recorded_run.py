@@ -12,7 +12,7 @@ import pyarrow.parquet as pq
 from attrs import frozen
 
 from laneweave.launch.explain.explanation import Explanation, explain
-from laneweave.launch.recordings.files import EVENTS, TRIPS, not_a_run, reading
+from laneweave.launch.recordings.files import EVENTS_FILE, TRIPS_FILE, not_a_run, reading
 from laneweave.launch.recordings.runs import scenario_of
 from laneweave.launch.recordings.trajectories import read_trajectories
 from laneweave.protocol.errors import unknown_name
@@ -41,7 +41,7 @@ class RecordedRun:
         Raises:
             BadInputError: the file cannot be read.
         """
-        return self._table(TRIPS)
+        return self._table(TRIPS_FILE)
 
     def trajectories(self, columns: Sequence[str] | None = None) -> pa.Table:
         """Return the recorded states of all vehicles, in the order of time.
@@ -73,13 +73,14 @@ class RecordedRun:
             BadInputError: the file cannot be read, or the run has no such event and this release no
                 such kind.
         """
-        with reading(self.folder, EVENTS), (self.folder / EVENTS).open(encoding="utf-8") as lines:
-            events = [json.loads(line) for line in lines]
+        with (
+            reading(self.folder, EVENTS_FILE),
+            (self.folder / EVENTS_FILE).open(encoding="utf-8") as lines,
+        ):
+            events = map(json.loads, lines)
             found = [event for event in events if kind is None or event["kind"] == kind]
-        if kind is None:
-            return events
         # Plug-ins and other releases have kinds of their own.
-        if not found and kind not in FIELDS:
+        if not found and kind is not None and kind not in FIELDS:
             raise unknown_name("kind", kind, FIELDS)
         return found
 
@@ -113,6 +114,6 @@ def load_run(folder: Path | str) -> RecordedRun:
     summary = read_summary(folder)
     if summary is None:
         raise not_a_run(folder, "its summary.json is missing or incomplete")
-    with reading(folder, TRIPS):
-        scenario = scenario_of(folder / TRIPS)
+    with reading(folder, TRIPS_FILE):
+        scenario = scenario_of(folder / TRIPS_FILE)
     return RecordedRun(folder, summary, scenario)

@@ -9,7 +9,7 @@ from typing import Any
 
 from attrs import define, field, frozen
 
-from laneweave.launch.recordings.files import EVENTS, reading
+from laneweave.launch.recordings.files import EVENTS_FILE, reading
 from laneweave.launch.recordings.formations import read_events
 from laneweave.protocol.wire.events import PART_CLOSED, PART_OPENED
 from laneweave.protocol.wire.obstacle_messages import PASSING
@@ -87,7 +87,7 @@ def closed_for_a_time(folder: Path) -> list[ClosedForATime]:
         BadInputError: the events cannot be read.
     """
     closed = ClosedParts()
-    with reading(folder, EVENTS):
+    with reading(folder, EVENTS_FILE):
         for event in read_events(folder, PART_CLOSED, PART_OPENED):
             if event.get("cause") != PASSING:
                 closed.add(event)

@@ -20,7 +20,7 @@ import pyarrow as pa
 import pyarrow.csv as pc
 import pyarrow.parquet as pq
 
-from laneweave.launch.recordings.files import TRAJECTORIES, reading
+from laneweave.launch.recordings.files import TRAJECTORIES_FILE, reading
 from laneweave.protocol.errors import CommandFailedError
 from laneweave.protocol.runtime.temporary_folders import temporary_folder
 from laneweave.protocol.summary import EnergyFigures
@@ -55,7 +55,7 @@ def energy_of(folder: Path, models: Mapping[str, str] = MODELS) -> dict[str, Ene
         OSError: there is no room for temporary files, or the program cannot be started.
     """
     program = sumo_program("emissionsDrivingCycle")
-    if program is None or not program.is_file() or not (folder / TRAJECTORIES).is_file():
+    if program is None or not program.is_file() or not (folder / TRAJECTORIES_FILE).is_file():
         return None
     totals = {model: Counter[str]() for model in models.values()}
     speeds = 0.0
@@ -85,7 +85,7 @@ def energy_of(folder: Path, models: Mapping[str, str] = MODELS) -> dict[str, Ene
 
 def _speeds(folder: Path) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Yield speeds [m/s] and accelerations [m/s2] of a run in parts."""
-    with reading(folder, TRAJECTORIES), pq.ParquetFile(folder / TRAJECTORIES) as file:
+    with reading(folder, TRAJECTORIES_FILE), pq.ParquetFile(folder / TRAJECTORIES_FILE) as file:
         names = ["speed_mps", "accel_mps2"]
         for batch in file.iter_batches(ROWS_AT_ONCE, columns=names):
             speed_mps, accel_mps2 = (column.to_numpy() for column in batch.columns)

@@ -10,9 +10,9 @@ from typing import Final
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.summary import SUMMARY_FILE
 
-TRAJECTORIES: Final = "trajectories.parquet"
-TRIPS: Final = "trips.parquet"
-EVENTS: Final = "events.jsonl"
+TRAJECTORIES_FILE: Final = "trajectories.parquet"
+TRIPS_FILE: Final = "trips.parquet"
+EVENTS_FILE: Final = "events.jsonl"
 
 
 def not_a_run(folder: Path, why: object) -> BadInputError:
@@ -22,7 +22,7 @@ def not_a_run(folder: Path, why: object) -> BadInputError:
 
 @contextmanager
 def reading(folder: Path, file: str) -> Iterator[None]:
-    """Convert errors while a run's file is read to a `BadInputError` that names it.
+    """Convert errors in reading a file of a run to a `BadInputError` that names the file.
 
     Raises:
         BadInputError: the file is missing, damaged, or has unexpected content.
@@ -34,7 +34,7 @@ def reading(folder: Path, file: str) -> Iterator[None]:
     except (OSError, ValueError, KeyError, TypeError) as error:
         if (folder / SUMMARY_FILE).is_file() and not (folder / file).exists():
             kept = "a run that kept this file"
-            if file == TRAJECTORIES:
+            if file == TRAJECTORIES_FILE:
                 kept += "; in a sweep: --keep-trajectories all"
             raise BadInputError(file, f"none in {folder}", kept) from error
         why = getattr(error, "strerror", None) or f"{type(error).__name__}: {error}"

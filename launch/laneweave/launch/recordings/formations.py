@@ -10,7 +10,7 @@ from typing import Any
 import pyarrow.parquet as pq
 
 from laneweave.launch.formation_columns import FormationColumns, Formations
-from laneweave.launch.recordings.files import EVENTS, TRIPS, reading
+from laneweave.launch.recordings.files import EVENTS_FILE, TRIPS_FILE, reading
 from laneweave.protocol.lattice import Lattice
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.wire.events import FORMATION_CLOSED
@@ -22,13 +22,14 @@ def read_events(folder: Path, *kinds: str) -> Iterator[Mapping[str, Any]]:
     Raises:
         BadInputError: the events cannot be read.
     """
-    path = folder / EVENTS
+    path = folder / EVENTS_FILE
     if not path.is_file():
         return
-    with reading(folder, EVENTS):
-        events = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
-        chosen = [event for event in events if not kinds or event["kind"] in kinds]
-    yield from chosen
+    with reading(folder, EVENTS_FILE):
+        for line in path.read_text(encoding="utf-8").splitlines():
+            event = json.loads(line)
+            if not kinds or event["kind"] in kinds:
+                yield event
 
 
 def closed_formations(folder: Path, scenario: Scenario) -> Formations:
@@ -48,14 +49,14 @@ def recorded_formations(folder: Path, lattice: Lattice) -> Formations:
         BadInputError: a file of the run cannot be read.
     """
     found: dict[int, FormationColumns] = {}
-    with reading(folder, EVENTS):
+    with reading(folder, EVENTS_FILE):
         for event in read_events(folder, FORMATION_CLOSED):
             if event.get("role") == "bridge":
                 rear, front = event["columns"]
                 number = int(event["formation"])
                 found[number] = FormationColumns(number, int(rear), int(front), float(event["t_s"]))
-    with reading(folder, TRIPS):
-        trips = pq.read_table(folder / TRIPS, columns=["formation"])
+    with reading(folder, TRIPS_FILE):
+        trips = pq.read_table(folder / TRIPS_FILE, columns=["formation"])
     numbers: set[int] = set(trips["formation"].drop_null().to_pylist())  # type: ignore[arg-type]
     for number in numbers:
         columns = lattice.block_range(number)

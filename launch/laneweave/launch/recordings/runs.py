@@ -11,7 +11,7 @@ from typing import Any
 import pyarrow.parquet as pq
 from attrs import evolve, frozen
 
-from laneweave.launch.recordings.files import TRAJECTORIES, TRIPS, not_a_run, reading
+from laneweave.launch.recordings.files import TRAJECTORIES_FILE, TRIPS_FILE, not_a_run, reading
 from laneweave.launch.run_methods import FORMATION, rank
 from laneweave.protocol.config.scenario_files import parse_scenario, to_tables
 from laneweave.protocol.errors import BadInputError
@@ -65,7 +65,7 @@ class Run:
     @property
     def has_trajectories(self) -> bool:
         """Whether trajectories were kept."""
-        return (self.folder / TRAJECTORIES).is_file()
+        return (self.folder / TRAJECTORIES_FILE).is_file()
 
     @property
     def preferred_percent(self) -> float | None:
@@ -163,12 +163,12 @@ def single_run(folder: Path) -> Run:
         BadInputError: the folder is not that of a finished run with trajectories, or the record of
             its point in a sweep cannot be read.
     """
-    if not (folder / TRAJECTORIES).is_file():
+    if not (folder / TRAJECTORIES_FILE).is_file():
         raise BadInputError("folder", str(folder), "the folder of a run, with trajectories.parquet")
-    with reading(folder, TRAJECTORIES):
-        scenario = scenario_of(folder / TRAJECTORIES)
-    with reading(folder, TRIPS):
-        pq.read_schema(folder / TRIPS)
+    with reading(folder, TRAJECTORIES_FILE):
+        scenario = scenario_of(folder / TRAJECTORIES_FILE)
+    with reading(folder, TRIPS_FILE):
+        pq.read_schema(folder / TRIPS_FILE)
     summary = read_summary(folder)
     if summary is None:
         raise not_a_run(folder, "its summary.json is missing or incomplete")

@@ -19,8 +19,7 @@ import pyarrow.parquet as pq
 from attrs import frozen
 from numpy.typing import NDArray
 
-from laneweave.launch.recordings.files import TRAJECTORIES as FILE
-from laneweave.launch.recordings.files import TRIPS, reading
+from laneweave.launch.recordings.files import TRAJECTORIES_FILE, TRIPS_FILE, reading
 from laneweave.launch.recordings.runs import scenario_of
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Lattice
@@ -101,8 +100,8 @@ def read_trips(folder: Path) -> dict[str, dict[str, Any]]:
     Raises:
         BadInputError: the trips cannot be read.
     """
-    with reading(folder, TRIPS):
-        return {trip["vehicle"]: trip for trip in pq.read_table(folder / TRIPS).to_pylist()}
+    with reading(folder, TRIPS_FILE):
+        return {trip["vehicle"]: trip for trip in pq.read_table(folder / TRIPS_FILE).to_pylist()}
 
 
 def read_trajectories(folder: Path, columns: Sequence[str] | None = None) -> pa.Table:
@@ -119,21 +118,21 @@ def read_trajectories(folder: Path, columns: Sequence[str] | None = None) -> pa.
     for name in names:
         if name not in TRAJECTORIES.names:
             raise BadInputError("columns", name, "any of " + ", ".join(TRAJECTORIES.names))
-    with reading(folder, FILE):
-        schema = (pq.read_schema(folder / FILE).metadata or {}).get(SCHEMA_KEY)
+    with reading(folder, TRAJECTORIES_FILE):
+        schema = (pq.read_schema(folder / TRAJECTORIES_FILE).metadata or {}).get(SCHEMA_KEY)
         if schema is None:
             return _from_first_schema(folder, names)
         if schema.decode() != TRAJECTORIES.schema:
             wanted = f"a recording with schema {TRAJECTORIES.schema} or an earlier one"
-            raise BadInputError(FILE, schema.decode(), wanted)
-        return pq.read_table(folder / FILE, columns=names)
+            raise BadInputError(TRAJECTORIES_FILE, schema.decode(), wanted)
+        return pq.read_table(folder / TRAJECTORIES_FILE, columns=names)
 
 
 def _from_first_schema(folder: Path, names: Sequence[str]) -> pa.Table:
     """Return columns of a recording without schema number; see the module's docstring."""
     sources = [source for name in names for source in _SOURCES.get(name, (name,))]
     wanted = [name for name in _FIRST_SCHEMA if name in sources]
-    table = pq.read_table(folder / FILE, columns=wanted).combine_chunks()
+    table = pq.read_table(folder / TRAJECTORIES_FILE, columns=wanted).combine_chunks()
     found: dict[str, Any] = {name: table[name] for name in wanted}
     if "reserved_column" in names:
         found["reserved_column"] = table["column"]
@@ -147,14 +146,14 @@ def _from_first_schema(folder: Path, names: Sequence[str]) -> pa.Table:
         vehicles = map(str, table["vehicle"].to_pylist())
         found["preferred_lane"] = [preferred.get(name) for name in vehicles]
     if "column" in names or "lane" in names:
-        lattice: Lattice = scenario_of(folder / FILE).lattice
+        lattice: Lattice = scenario_of(folder / TRAJECTORIES_FILE).lattice
         t_s, s_m, y_m = (
             table[name].to_numpy().astype(np.float64) for name in ("t_s", "s_m", "y_m")
         )
         columns, found["lane"] = body_cells(t_s, s_m, y_m, lattice)
         no_lattice = np.asarray(table["column"].is_null())
         found["column"] = pa.array(columns, mask=no_lattice)
-    whole = TRAJECTORIES.arrow_schema(pq.read_schema(folder / FILE).metadata)
+    whole = TRAJECTORIES.arrow_schema(pq.read_schema(folder / TRAJECTORIES_FILE).metadata)
     chosen = pa.schema([field for field in whole if field.name in names])
     schema = chosen.with_metadata(whole.metadata or {})
     arrays = [

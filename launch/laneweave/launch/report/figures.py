@@ -15,7 +15,7 @@ from attrs import frozen
 from laneweave.launch.drawing.colours import CLOSED_FILL
 from laneweave.launch.drawing.figures import INK
 from laneweave.launch.drawing.road_scene import closed_parts
-from laneweave.launch.recordings.files import TRIPS, reading
+from laneweave.launch.recordings.files import TRIPS_FILE, reading
 from laneweave.launch.recordings.runs import Comparison, Run
 from laneweave.launch.recordings.trajectories import Floats, read_tracks
 from laneweave.launch.report.style import (
@@ -166,8 +166,8 @@ def _travel_times(runs: Iterable[Run]) -> Floats:
     """Return the travel times [s] of the counted vehicles."""
     found = [np.empty(0)]
     for run in runs:
-        with reading(run.folder, TRIPS):
-            table = pq.read_table(run.folder / TRIPS, columns=["travel_time_s", "counted"])
+        with reading(run.folder, TRIPS_FILE):
+            table = pq.read_table(run.folder / TRIPS_FILE, columns=["travel_time_s", "counted"])
         found.append(table.filter(pc.field("counted"))["travel_time_s"].drop_null().to_numpy())
     return np.concatenate(found)
 

@@ -20,7 +20,7 @@ from laneweave.coordinator.planning.path_map import RelativePathMap
 from laneweave.launch.drawing.colours import lane_colours, text_colour, vehicle_colour
 from laneweave.launch.drawing.figures import INK, write
 from laneweave.launch.formation_columns import FormationColumns
-from laneweave.launch.recordings.files import EVENTS, reading
+from laneweave.launch.recordings.files import EVENTS_FILE, reading
 from laneweave.launch.recordings.formations import read_events, recorded_formations
 from laneweave.launch.recordings.runs import Run
 from laneweave.launch.recordings.trajectories import NO_LATTICE, Floats, Tracks, read_trips
@@ -182,7 +182,7 @@ def _driven_slots(
     tick_s, slot_s = run.scenario.runtime.tick_s, run.scenario.timing.cycles_s[0]
     last_s = max(changes_s, default=math.inf) + 0.5 * tick_s
     together, found = {formation}, None
-    with reading(run.folder, EVENTS):
+    with reading(run.folder, EVENTS_FILE):
         for event in read_events(run.folder, FORMATIONS_JOINED, PLAN_MADE):
             if event.get("role") != "coordinator":
                 continue

@@ -31,7 +31,7 @@ from laneweave.launch.drawing.road_picture import (
 from laneweave.launch.drawing.road_scene import closed_parts, ramp_edges
 from laneweave.launch.formation_columns import Formations
 from laneweave.launch.recordings.closed_parts import ClosedForATime, closed_for_a_time
-from laneweave.launch.recordings.files import TRAJECTORIES
+from laneweave.launch.recordings.files import TRAJECTORIES_FILE
 from laneweave.launch.recordings.formations import closed_formations
 from laneweave.launch.recordings.runs import scenario_of
 from laneweave.launch.recordings.trajectories import (
@@ -93,7 +93,7 @@ def road_snapshots(
         stretch_m: (from m, to m); None: around this part, or else `default_stretch_m`.
         dpi: resolution in dots per inch.
     """
-    scenario = scenario_of(folder / TRAJECTORIES)
+    scenario = scenario_of(folder / TRAJECTORIES_FILE)
     road = scenario.road
     tracks, parts = read_tracks(folder), closed_for_a_time(folder)
     if parts and not times and stretch_m is None:

@@ -27,12 +27,13 @@ from laneweave.launch.faults.network_namespaces import ENDPOINT, HUB, LISTEN, op
 from laneweave.launch.faults.shared_counters import MessageFaults, SharedBoard
 from laneweave.launch.observe.observer import Observer
 from laneweave.launch.observe.road_view import RoadView
+from laneweave.launch.recordings.files import EVENTS_FILE
 from laneweave.launch.run.logs import last_error
 from laneweave.launch.run.outcome import Outcome, complete_summary
 from laneweave.launch.run.progress import RunProgress
 from laneweave.launch.run.role_processes import RoleExit, RoleProcesses, RoleStart
 from laneweave.launch.run.roles import BAD_INPUT, fork_server
-from laneweave.launch.run.run_folder import EVENTS_FILE, LOG_FILE, ROUTER_READY_FILE
+from laneweave.launch.run.run_folder import LOG_FILE, ROUTER_READY_FILE
 from laneweave.protocol.config.participants import coordinator_names
 from laneweave.protocol.config.scenario_files import parse_scenario, to_tables
 from laneweave.protocol.errors import BadInputError, CommandFailedError, RefusedError

@@ -16,6 +16,7 @@ from rich.table import Table
 from laneweave.coordinator.planning.plug_ins.registry import PLANNERS
 from laneweave.launch.faults.failover import Failover
 from laneweave.launch.recordings.energy import energy_of
+from laneweave.launch.recordings.files import TRIPS_FILE
 from laneweave.launch.recordings.runs import scenario_of
 from laneweave.launch.report.summary_table import summary_rows
 from laneweave.launch.run_methods import FORMATION, REFERENCE_METHODS
@@ -123,7 +124,7 @@ def complete_summary(
             summary = _with_energy(folder, summary)
     except OSError as error:
         problems = (*problems, f"the summary cannot be written: {error.strerror or error}")
-    trips = folder / "trips.parquet"
+    trips = folder / TRIPS_FILE
     of_sumo = trips.is_file() and bool(scenario_of(trips).sumo.config)
     # A signal may arrive when the run is already complete.
     interrupted = interrupted and summary.ending == Ending.INTERRUPTED.value
@@ -197,7 +198,7 @@ def print_outcome(outcome: Outcome, console: Console) -> None:
         table = Table(title=f"laneweave run: {escape(str(outcome.folder))}", show_header=False)
         table.add_column()
         table.add_column(justify="right")
-        trips = outcome.folder / "trips.parquet"
+        trips = outcome.folder / TRIPS_FILE
         scenario = scenario_of(trips) if trips.is_file() else None
         for label, value in summary_rows(summary, scenario):
             table.add_row(label, escape(value))

@@ -13,6 +13,7 @@ from pathlib import Path
 
 from attrs import evolve
 
+from laneweave.launch.recordings.files import EVENTS_FILE, TRAJECTORIES_FILE, TRIPS_FILE
 from laneweave.protocol.errors import BadInputError, CommandFailedError, RefusedError
 from laneweave.protocol.files import write_atomically
 from laneweave.protocol.scenario.fields import Scenario
@@ -29,9 +30,8 @@ LOG_FILE = "log.jsonl"
 """Log of all processes of a run, which keep it locked: a folder is used by one run at a time."""
 ROUTER_READY_FILE = "router.ready"
 """File in the temporary folder of a run that exists once the router listens."""
-EVENTS_FILE = "events.jsonl"
 EARLY_FILES = frozenset(
-    (LOG_FILE, EVENTS_FILE, SUMMARY_FILE, "ticks.parquet", "trajectories.parquet", "trips.parquet")
+    (LOG_FILE, EVENTS_FILE, SUMMARY_FILE, "ticks.parquet", TRAJECTORIES_FILE, TRIPS_FILE)
 )
 """Files that an interrupted run may have before a vehicle enters."""
 FOLDER_RULE = "a new or empty folder"

@@ -19,7 +19,7 @@ from pathlib import Path
 
 from attrs import frozen
 
-from laneweave.launch.recordings.files import EVENTS, TRAJECTORIES, TRIPS
+from laneweave.launch.recordings.files import EVENTS_FILE, TRAJECTORIES_FILE, TRIPS_FILE
 from laneweave.launch.run.roles import THREAD_LIMITS
 from laneweave.launch.sweep.points import Point
 from laneweave.protocol.config.scenario_files import to_tables
@@ -46,8 +46,8 @@ class PointResult:
 
 def kept_files(point: Point) -> tuple[str, ...]:
     """Return the names of the files to keep, besides `LOG_FILE` after a failure."""
-    kept = (SUMMARY_FILE, TRIPS, EVENTS)
-    return (*kept, TRAJECTORIES) if point.keep_trajectories else kept
+    kept = (SUMMARY_FILE, TRIPS_FILE, EVENTS_FILE)
+    return (*kept, TRAJECTORIES_FILE) if point.keep_trajectories else kept
 
 
 class StoppedError(Exception):

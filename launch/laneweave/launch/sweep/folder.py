@@ -23,7 +23,7 @@ from typing import Self
 
 from attrs import evolve
 
-from laneweave.launch.recordings.files import TRIPS
+from laneweave.launch.recordings.files import TRIPS_FILE
 from laneweave.launch.recordings.results_over_seeds import flatten, write_results
 from laneweave.launch.recordings.runs import SWEEP_FILE, Run, sweep_runs, write_point
 from laneweave.launch.run_methods import REFERENCE_METHODS, affects, labelled
@@ -122,7 +122,7 @@ class SweepFolder:
         return (
             run is not None
             and run.summary is not None
-            and (run.folder / TRIPS).is_file()
+            and (run.folder / TRIPS_FILE).is_file()
             and (not point.keep_trajectories or run.has_trajectories)
         )
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from laneweave.launch.drawing.colours import trip_lane
 from laneweave.launch.formation_columns import Formations
-from laneweave.launch.recordings.files import EVENTS, reading
+from laneweave.launch.recordings.files import EVENTS_FILE, reading
 from laneweave.launch.recordings.formations import closed_formations, read_events
 from laneweave.launch.recordings.runs import single_run
 from laneweave.launch.recordings.trajectories import NO_LATTICE, Tracks, read_tracks, read_trips
@@ -82,7 +82,7 @@ class Recording:
         run = single_run(folder)
         self._tracks = read_tracks(folder)
         self._trips = read_trips(folder)
-        with reading(folder, EVENTS):
+        with reading(folder, EVENTS_FILE):
             self._moments = list(_moments(folder))
         self._formations = closed_formations(folder, run.scenario).by_number
         self._run = run

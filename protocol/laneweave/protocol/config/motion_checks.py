@@ -6,7 +6,12 @@ import math
 
 from laneweave.protocol.config.rules import compare, require
 from laneweave.protocol.scenario.fields import Scenario
-from laneweave.protocol.scenario.vehicle_tables import MAX_HORIZON_TICKS, PEAK_ACCEL, Vehicle
+from laneweave.protocol.scenario.vehicle_tables import (
+    MAX_HORIZON_TICKS,
+    PEAK_ACCEL,
+    PEAK_JERK,
+    Vehicle,
+)
 from laneweave.protocol.vehicle.emergency_brake import ERROR_SIGMAS, EmergencyBrake, spare_error_m
 from laneweave.protocol.wire.messages import CAR, Neighbour
 
@@ -196,7 +201,7 @@ def check_settling(scenario: Scenario) -> None:
     min_s = max(
         15.0 / 8.0 * offset_m / speed_mps,
         math.sqrt(PEAK_ACCEL * offset_m / accel_mps2),
-        math.cbrt(60.0 * offset_m / jerk_mps3),
+        math.cbrt(PEAK_JERK * offset_m / jerk_mps3),
     )
     require(
         formation.settle_s >= min_s,

@@ -10,7 +10,7 @@ from attrs import frozen
 
 from laneweave.protocol.road_layout import LaneSection
 from laneweave.protocol.scenario.formation_table import FormationSettings
-from laneweave.protocol.scenario.vehicle_tables import PEAK_ACCEL, Vehicle
+from laneweave.protocol.scenario.vehicle_tables import PEAK_ACCEL, PEAK_JERK, Vehicle
 from laneweave.protocol.summary import TTC_SHORT_S
 
 SHORTEST_CYCLE_S, LONGEST_CYCLE_S = 4.0, 7.0
@@ -21,13 +21,13 @@ ROLLING_CYCLES_S = ((2000.0, 6.0), (2200.0, 5.4), (math.inf, 5.0))
 """Volumes [vehicles/(lane h)] in ascending order, and T_F [s] of the rolling operation up to each;
 denser traffic needs more steps on the same road (decision 76)."""
 GENTLE_RATIO = 0.9
-"""Maximum ratio between acceleration and jerk of a minimum-jerk move and their limits at which
-there is a gentle move of the same duration (decision 76)."""
+"""Maximum ratio between the peaks of a minimum-jerk move, its acceleration and its jerk, and their
+limits, at which there is a gentle move of the same duration (decision 76)."""
 MIN_TTC_S = TTC_SHORT_S + 0.2
 """Minimum time to collision of a gentle move, with a margin for tracking errors."""
 GENTLE_TTC_SHARE = 0.7
-"""Time to collision that a gentle move can keep, as a fraction of `longest_ttc_s`: a cautious
-estimate, as `GENTLE_RATIO`."""
+"""Minimum time to collision that a gentle move can keep, as a fraction of `longest_ttc_s`; like
+`GENTLE_RATIO`, a conservative estimate."""
 MIN_MERGING_SLOTS = 4
 """Number of slots that the rolling operation should have in a lane that begins and ends on the
 road, as that of a ramp; with three, up to 1 % of the vehicles did not change lanes in time at 2000
@@ -135,9 +135,9 @@ class Timing:
         cars, pitch_m = self._cars, self._formation.gap_m
         beyond_m = 2.0 * pitch_m - cars.length_m
         by_ttc_s = MIN_TTC_S / (GENTLE_TTC_SHARE * longest_ttc_s(beyond_m, pitch_m, 1.0))
-        by_jerk_s = math.cbrt(60.0 * pitch_m / (GENTLE_RATIO * cars.max_jerk_mps3))
-        by_accel_s = math.sqrt(PEAK_ACCEL * pitch_m / (GENTLE_RATIO * cars.max_accel_mps2))
-        return self._shortest_from(max(by_ttc_s, by_jerk_s, by_accel_s))
+        by_jerk_s = math.cbrt(PEAK_JERK * pitch_m / (GENTLE_RATIO * cars.max_jerk_mps3))
+        within_accel_s = self._shortest_within(GENTLE_RATIO * cars.max_accel_mps2)
+        return max(self._shortest_from(max(by_ttc_s, by_jerk_s)), within_accel_s)
 
     def _shortest_within(self, accel_mps2: float) -> float:
         """Return the shortest T_F with minimum-jerk moves within a limit; if none, the longest."""

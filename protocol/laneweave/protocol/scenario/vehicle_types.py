@@ -9,7 +9,12 @@ from attrs import frozen
 
 from laneweave.protocol.lattice import Cell, displacements
 from laneweave.protocol.scenario.formation_table import FormationSettings
-from laneweave.protocol.scenario.vehicle_tables import PEAK_ACCEL, Vehicle, VehicleTypeSettings
+from laneweave.protocol.scenario.vehicle_tables import (
+    PEAK_ACCEL,
+    PEAK_JERK,
+    Vehicle,
+    VehicleTypeSettings,
+)
 from laneweave.protocol.wire.messages import CAR
 
 GAP_AHEAD_M = 9.0
@@ -93,12 +98,12 @@ class VehicleTypes(Mapping[str, VehicleType]):
         """Limits along the road that suffice for a move by a column in the shortest T_F.
 
         Keys are fields of table `vehicle`, values are absolute. They are the peaks of a
-        minimum-jerk move over d in T, `PEAK_ACCEL` d / T^2 and 60 d / T^3, or those of cars, if
-        these are lower: the trajectory of a car keeps within its limits.
+        minimum-jerk move over d in T, `PEAK_ACCEL` d / T^2 and `PEAK_JERK` d / T^3, or those of
+        cars, if these are lower: the trajectory of a car keeps within its limits.
         """
         d_m, cars = self._formation.gap_m, self._cars
         move_s = self._cycle_s - self._formation.slack_s
-        accel_mps2, jerk_mps3 = PEAK_ACCEL * d_m / move_s**2, 60.0 * d_m / move_s**3
+        accel_mps2, jerk_mps3 = PEAK_ACCEL * d_m / move_s**2, PEAK_JERK * d_m / move_s**3
         return {
             "max_accel_mps2": min(accel_mps2, cars.max_accel_mps2),
             "min_accel_mps2": min(accel_mps2, -cars.min_accel_mps2),

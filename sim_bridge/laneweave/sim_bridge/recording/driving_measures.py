@@ -266,7 +266,7 @@ class DrivingMeasures:
         chosen = (behind >= known) & (closing_mps > 0.0)
         behind, ahead, closing_mps = behind[chosen], ahead[chosen], closing_mps[chosen]
         gap_m = np.maximum(rows.s_m[ahead] - found.length_m[ahead] - rows.s_m[behind], 0.0)
-        with np.errstate(over="ignore"):  # as they stop, speeds fall to subnormal numbers
+        with np.errstate(over="ignore"):  # speeds of stopping vehicles can be subnormal
             ttc_s = gap_m / closing_mps
         apart = gap_m > 0.0
         drac_mps2 = closing_mps[apart] ** 2 / (2.0 * gap_m[apart])

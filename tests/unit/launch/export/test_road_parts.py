@@ -1,4 +1,4 @@
-"""Parts of lanes are where the road is open, and lead to where vehicles may drive."""
+"""Parts of lanes cover the open road, and name the parts behind and beside them."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def part_at(parts: tuple[RoadPart, ...], lane: int, s_m: float) -> RoadPart | No
 def test_parts_are_where_the_road_is_open(name: str) -> None:
     scenario = load_scenario(SCENARIOS / f"{name}.toml")
     parts, road = road_parts(scenario), scenario.road
-    assert [part.number for part in parts] == list(range(len(parts)))
+    assert [part.number for part in parts] == list(range(1, len(parts) + 1))
     for s_m in range(0, int(road.length_m), 7):
         closed = {one.lane for one in road.closures if one.from_m <= s_m < one.to_m}
         opened = {one.lane for one in scenario.entrance if one.at_m <= s_m < one.merge_m}
@@ -43,14 +43,15 @@ def check_neighbours(parts: tuple[RoadPart, ...]) -> None:
     for part in parts:
         for side, number in enumerate(part.beside):
             if number is not None:
-                other = parts[number]
+                other = parts[number - 1]
                 assert other.beside[1 - side] == part.number
                 assert (other.from_m, other.to_m) == (part.from_m, part.to_m)
                 assert other.lane == part.lane + (-1, 1)[side]
             else:
                 assert not part.may_cross[side]
         if part.behind is not None:
-            assert (parts[part.behind].lane, parts[part.behind].to_m) == (part.lane, part.from_m)
+            behind = parts[part.behind - 1]
+            assert (behind.lane, behind.to_m) == (part.lane, part.from_m)
 
 
 def test_vehicles_may_not_cross_solid_lines_of_their_lane() -> None:

@@ -13,7 +13,7 @@ import pytest
 
 from laneweave.launch.recordings import energy
 from laneweave.launch.recordings.energy import MODELS, energy_of
-from laneweave.launch.recordings.files import TRAJECTORIES
+from laneweave.launch.recordings.files import TRAJECTORIES_FILE
 from laneweave.launch.run.reference_run import ReferenceRun
 from laneweave.launch.run_methods import LC2013
 from laneweave.protocol.config.scenario_files import load_scenario
@@ -32,7 +32,7 @@ def write_run(folder: Path, speeds_mps: list[float], accels_mps2: list[float]) -
     columns = {"speed_mps": speeds_mps, "accel_mps2": accels_mps2}
     table = pa.table({name: pa.array(own, pa.float32()) for name, own in columns.items()})
     schema = table.schema.with_metadata(metadata_of(Scenario()))
-    pq.write_table(table.cast(schema), folder / TRAJECTORIES)
+    pq.write_table(table.cast(schema), folder / TRAJECTORIES_FILE)
 
 
 @pytest.mark.parametrize("model", ["HBEFA4/PC_petrol_Euro-4", "HBEFA4/PC_BEV"])
@@ -107,8 +107,8 @@ def test_models_are_refused_by_name(models: dict[str, str], message: str, tmp_pa
 
 def test_unreadable_trajectories_are_refused(tmp_path: Path) -> None:
     write_run(tmp_path, [15.0], [0.0])
-    data = (tmp_path / TRAJECTORIES).read_bytes()
-    (tmp_path / TRAJECTORIES).write_bytes(data[:100] + bytes(50) + data[150:])
+    data = (tmp_path / TRAJECTORIES_FILE).read_bytes()
+    (tmp_path / TRAJECTORIES_FILE).write_bytes(data[:100] + bytes(50) + data[150:])
     with pytest.raises(BadInputError):
         energy_of(tmp_path)
 

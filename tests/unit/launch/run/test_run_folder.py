@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 from attrs import evolve
 
-from laneweave.launch.run.run_folder import EVENTS_FILE, LOG_FILE, new_folder, repair_run
+from laneweave.launch.recordings.files import EVENTS_FILE
+from laneweave.launch.run.run_folder import LOG_FILE, new_folder, repair_run
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.summary import read_summary, write_summary
