@@ -170,7 +170,13 @@ def run_trials(part: str, out: Path, root: Path, jobs: int) -> bool:
     return all(ended)
 
 
-def collect(out: Path, sweeps: Iterable[Path], labels: Collection[str], images: Path) -> Evidence:
+def collect(
+    out: Path,
+    sweeps: Iterable[Path],
+    labels: Collection[str],
+    images: Path,
+    needed: Collection[Key] = (),
+) -> Evidence:
     """Return the evidence of the existing runs, and draw their figures.
 
     Args:
@@ -178,6 +184,7 @@ def collect(out: Path, sweeps: Iterable[Path], labels: Collection[str], images: 
         sweeps: folders of other sweeps; empty: the sweep in `out`, if there is one.
         labels: labels of the rows; figures show all runs.
         images: folder of the figures.
+        needed: as in `draw_pictures`.
 
     Raises:
         BadInputError: a folder contains no sweep, or the runs cannot be compared.
@@ -196,7 +203,7 @@ def collect(out: Path, sweeps: Iterable[Path], labels: Collection[str], images: 
         return evidence
     runs = list(runs_of(folders))
     rows = [row for row in run_rows(runs) if row.label in labels]
-    pictures = draw_pictures(runs, images)
+    pictures = draw_pictures(runs, images, needed)
     return evidence.updated_with(
         Evidence(setting=setting_of(runs), runs=tuple(rows), pictures=pictures)
     )
@@ -219,15 +226,16 @@ def refresh(
         sweeps: as in `collect`.
         labels: as in `collect`.
         docs: folder of the documents.
-        add_runs: keep recorded runs of other seeds and volumes, and figures that are not drawn
-            again.
+        add_runs: keep recorded runs of other seeds and volumes, and figures that show recorded
+            points without new runs.
 
     Raises:
         BadInputError, OSError, ValueError, KeyError: as in `collect`.
     """
     path = docs / "evidence" / "evaluation.json"
     recorded = read_evidence(path)
-    new = collect(out, sweeps, labels, docs / "images")
+    needed = recorded.by_key if add_runs else ()
+    new = collect(out, sweeps, labels, docs / "images", needed)
     evidence = recorded.updated_with(new, add_runs=add_runs)
     write_evidence(evidence, path)
     if new.runs:

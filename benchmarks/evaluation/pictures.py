@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import Final
 
 from attrs import frozen
 
 from evaluation.evidence import Picture
+from evaluation.points import Key
 from evaluation.programme import LABELS, VOLUMES
 from evaluation.statements import PAPER_STRETCH_M, PAPER_VOLUMES
 from laneweave.launch.recordings.runs import Comparison, Run
@@ -33,21 +34,32 @@ class _Figure:
     traced: bool = False
     """Whether the runs need trajectories."""
 
+    def shows(self, label: str, volume_veh_per_lane_h: float) -> bool:
+        """Return whether runs with this label and volume are in the figure."""
+        return label in self.labels and volume_veh_per_lane_h in self.volumes
 
-def draw_pictures(runs: Sequence[Run], folder: Path) -> tuple[Picture, ...]:
-    """Draw every figure that has runs, and return the drawn figures.
+
+def draw_pictures(
+    runs: Sequence[Run], folder: Path, needed: Collection[Key] = ()
+) -> tuple[Picture, ...]:
+    """Draw figures, and return those drawn.
 
     Args:
         runs: runs of the sweep; failed ones are excluded.
         folder: folder of the figures.
+        needed: points that a figure must not lose: one that has no run at one of its needed points
+            is not drawn.
     """
     drawn = []
+    present = {(run.label, run.volume_veh_per_lane_h) for run in runs}
+    missing = set(needed) - present
     for figure in _FIGURES:
+        if any(figure.shows(*point) for point in missing):
+            continue
         chosen = Comparison.of(
             run
             for run in runs
-            if run.label in figure.labels
-            and run.volume_veh_per_lane_h in figure.volumes
+            if figure.shows(run.label, run.volume_veh_per_lane_h)
             and (run.has_trajectories or not figure.traced)
         )
         if chosen.runs:
