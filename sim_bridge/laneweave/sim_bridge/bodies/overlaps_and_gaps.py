@@ -199,9 +199,9 @@ class Bodies:
         """
         # Sorted by pose, so that ties between fronts do not depend on names.
         bodies = sorted(zip(self._poses, self._extents, self._sizes, strict=True))
-        # A vehicle farther ahead can have the smaller gap only if its front is closer than rotation
-        # can extend a body.
-        slack_m = self._reach_m
+        # Of bodies that are not rotated, one farther ahead can have the smaller gap only if it is
+        # longer. A rotated body can also have a gap that exceeds the distance between the fronts.
+        reach_m = self._reach_m
         count = len(bodies)
         rotated = []
         """(lower bound of the gap [m], indices) of pairs with a rotated body."""
@@ -217,12 +217,13 @@ class Bodies:
                     break
                 if other_low >= high or other_high <= low:
                     continue
+                is_rotated = heading != 0.0 or other[2] != 0.0
                 if horizon_m == math.inf:
-                    horizon_m = distance_m + slack_m
+                    horizon_m = distance_m + (2.0 * reach_m if is_rotated else reach_m)
                     if speed_mps > 0.0:
                         min_headway = min(min_headway, distance_m / speed_mps)
                 bound_m = max(other_rear - front, rear - other_front)
-                if heading != 0.0 or other[2] != 0.0:
+                if is_rotated:
                     rotated.append((bound_m, index, ahead))
                 elif bound_m < min_gap:
                     min_gap = bound_m  # exact for unrotated bodies

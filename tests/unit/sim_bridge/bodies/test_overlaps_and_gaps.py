@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from laneweave.protocol.wire.messages import Neighbour
@@ -145,6 +145,9 @@ def brute_gap(road: dict[str, Pose]) -> float:
 
 @pytest.mark.slow
 @given(st.lists(POSES, min_size=2, max_size=4), TRUCKS)
+@example(
+    [(16.0, 5.0, 0.0, 0.0), (0.0, 4.0, 0.5, 0.0), (1.0, 1.0, 0.5, 0.0)], [True, True] + [False] * 6
+).via("the gap behind the body next ahead exceeds the distance of the fronts")
 @examples(25)
 def test_least_gap_agrees_with_slices(poses: list[Pose], trucks: list[bool]) -> None:
     poses = [(s, y, 0.0 if abs(heading) < 1e-3 else heading, v) for s, y, heading, v in poses]
