@@ -201,8 +201,11 @@ def checked_method(name: str, field_name: str) -> str:
     return name
 
 
-_READ_BY_ALL = ("schema", "seed", "road", "demand", "vehicle", "runtime", "formation.speed_mps")
-"""Tables and fields of a scenario that every method may read."""
+_OF_METHODS = (RULE, LC2013)
+"""Tables of a scenario that only the method of the same name reads."""
+_OF_FORMATION_CONTROL = ("formation", "sensing", "braking", "tracking", "network", "radio")
+"""Tables of a scenario that built-in reference methods do not read, except `_READ_BY_ALL`."""
+_READ_BY_ALL = "formation.speed_mps"
 _WITHOUT_EFFECT = ("security", "service", "observation")
 """Tables of a scenario that do not affect the results of runs."""
 
@@ -213,10 +216,10 @@ def affects(field_name: str, method: str) -> bool:
     if table in _WITHOUT_EFFECT:
         return False
     if method == FORMATION:
-        return table not in (RULE, LC2013)
-    if not REFERENCE_METHODS.is_built_in(method):
+        return table not in _OF_METHODS
+    if field_name == _READ_BY_ALL or not REFERENCE_METHODS.is_built_in(method):
         return True  # nothing is known about a plug-in
-    return table == method or table in _READ_BY_ALL or field_name in _READ_BY_ALL
+    return table == method or table not in (*_OF_METHODS, *_OF_FORMATION_CONTROL)
 
 
 def parse_methods(text: str) -> tuple[str, ...]:

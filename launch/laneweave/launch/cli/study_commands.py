@@ -121,7 +121,10 @@ def report(
         typer.Option("--figures", help="Format of figures; SVG and PDF: beside those of the page."),
     ] = FigureFormat.PNG,
 ) -> None:
-    """Write figures and a page for each finished run, and for a sweep or several runs together."""
+    """Write figures and a page for each finished run, and for a sweep or several runs together.
+
+    Runs of a method are averaged if they differ only in volume and seed.
+    """
     from laneweave.launch.recordings.runs import Comparison, is_sweep, runs_of, single_run
     from laneweave.launch.report.report import REPORT_DPI, report_comparison, report_run
 

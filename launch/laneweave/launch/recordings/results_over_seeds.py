@@ -7,7 +7,7 @@ A sweep writes the table as `results.parquet`.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from laneweave.launch.recordings.runs import Run
+from laneweave.launch.recordings.runs import Run, flatten
 from laneweave.protocol.files import write_atomically
 from laneweave.protocol.summary import described
 from laneweave.sim_bridge.recording.columns import SCHEMA_KEY, Column, Table
@@ -94,18 +94,6 @@ def over_seeds(table: pa.Table, wanted: Iterable[tuple[str, str]]) -> list[dict[
     grouped = table.group_by(KEYS, use_threads=False)
     rows = grouped.aggregate([("seed", "count"), *aggregations]).to_pylist()
     return [{"runs": row.pop("seed_count"), **row} for row in rows]
-
-
-def flatten(tables: Mapping[str, Any], separator: str) -> dict[str, Any]:
-    """Return all values of nested tables by path."""
-    flat: dict[str, Any] = {}
-    for key, value in tables.items():
-        if isinstance(value, Mapping):
-            inner = flatten(value, separator)
-            flat |= {f"{key}{separator}{name}": one for name, one in inner.items()}
-        else:
-            flat[key] = value
-    return flat
 
 
 def _described(name: str) -> tuple[str, str]:

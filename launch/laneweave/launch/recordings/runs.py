@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ import pyarrow.parquet as pq
 from attrs import evolve, frozen
 
 from laneweave.launch.recordings.files import TRAJECTORIES_FILE, TRIPS_FILE, not_a_run, reading
-from laneweave.launch.run_methods import FORMATION, rank
+from laneweave.launch.run_methods import FORMATION, affects, rank
 from laneweave.protocol.config.scenario_files import parse_scenario, to_tables
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.fields import Scenario
@@ -23,6 +23,8 @@ from laneweave.sim_bridge.recording.columns import SCENARIO_KEY
 SWEEP_FILE, POINT_FILE = "sweep.json", "point.json"
 """Files that identify the folders of sweeps and of their points."""
 POINT_SCHEMA = "laneweave.sweep.point/1"
+VARIED = ("demand.volume_veh_per_lane_h", "seed")
+"""Fields of a scenario in which runs of a label may differ."""
 
 
 @frozen
@@ -78,6 +80,12 @@ class Run:
         return self.summary.preferred_percent
 
     @property
+    def settings(self) -> dict[str, Any]:
+        """Values of the scenario that can change the results, by path (`table.field`)."""
+        values = flatten(to_tables(self.scenario), ".")
+        return {name: one for name, one in values.items() if affects(name, self.method)}
+
+    @property
     def order(self) -> tuple[tuple[int, str], float, int]:
         """Sort key: label, volume, seed."""
         return rank(self.label), self.volume_veh_per_lane_h, self.scenario.seed
@@ -93,17 +101,23 @@ class Comparison:
 
     @classmethod
     def of(cls, runs: Iterable[Run]) -> Comparison:
-        """Sort runs; runs with the same label, volume and seed are labelled by folder name."""
-        listed = list(runs)
-        counts = Counter(run.order for run in listed)
-        named = [
-            evolve(run, label=run.folder.resolve().name) if counts[run.order] > 1 else run
-            for run in listed
-        ]
-        named.sort(key=lambda run: run.order)
+        """Sort runs; a folder that is named twice is one run.
+
+        Runs of a label that differ in more than volume and seed, or have other faults, are not
+        averaged: they get other labels, which contain their folder or that of their sweep.
+        """
+        all_runs = list({(run.folder.resolve(), run.label): run for run in runs}.values())
+        listed = all_runs
+        for name in (_last_part, str):
+            alike = _labels_of_like_runs(listed)
+            listed = [
+                run if run.label in alike else _labelled_by_folder(original, name)
+                for run, original in zip(listed, all_runs, strict=True)
+            ]
+        listed.sort(key=lambda run: run.order)
         return cls(
-            tuple(run for run in named if not run.reason),
-            tuple(run for run in named if run.reason),
+            tuple(run for run in listed if not run.reason),
+            tuple(run for run in listed if run.reason),
         )
 
     @property
@@ -133,6 +147,44 @@ class Comparison:
         """Return a label's `representative` run at the highest volume that has one, or None."""
         found = (self.representative(label, volume) for volume in reversed(self.volumes))
         return next((run for run in found if run is not None), None)
+
+
+def _labels_of_like_runs(runs: Iterable[Run]) -> set[str]:
+    """Return the labels whose runs differ in volume or seed, and in nothing else."""
+    counts = Counter(run.order for run in runs)
+    kinds: dict[str, set[str]] = {}
+    for run in runs:
+        own = run.settings | dict.fromkeys(VARIED)
+        faults = None if run.summary is None else run.summary.faults
+        if faults is not None:
+            own["faults"] = sorted({one["fault"] for one in faults["injected"]})
+        kinds.setdefault(run.label, set()).add(repr(own))
+    repeated = {run.label for run in runs if counts[run.order] > 1}
+    return {label for label, found in kinds.items() if len(found) == 1} - repeated
+
+
+def _labelled_by_folder(run: Run, name: Callable[[Path], str]) -> Run:
+    """Return a run whose label names its folder, or besides its label that of its sweep."""
+    folder = run.folder.resolve()
+    if is_sweep(folder.parent):
+        return evolve(run, label=f"{run.label} ({name(folder.parent)})")
+    return evolve(run, label=name(folder))
+
+
+def _last_part(path: Path) -> str:
+    return path.name
+
+
+def flatten(tables: Mapping[str, Any], separator: str) -> dict[str, Any]:
+    """Return all values of nested tables by path."""
+    flat: dict[str, Any] = {}
+    for key, value in tables.items():
+        if isinstance(value, Mapping):
+            inner = flatten(value, separator)
+            flat |= {f"{key}{separator}{name}": one for name, one in inner.items()}
+        else:
+            flat[key] = value
+    return flat
 
 
 def scenario_of(path: Path) -> Scenario:

@@ -97,8 +97,9 @@ def driven_map(run: Run, tracks: Tracks, formation: int | None) -> DrivenMap | N
     trips = read_trips(run.folder)
     members: dict[int, list[tuple[int, int]]] = {}
     for number, name in enumerate(tracks.names):
-        trip = trips[name]
-        if trip["formation"] is not None:
+        # A run that was killed may have saved a vehicle's first positions and not yet its trip.
+        trip = trips.get(name)
+        if trip is not None and trip["formation"] is not None:
             members.setdefault(trip["formation"], []).append((number, trip["preferred_lane"]))
     if formation is None:
         if not members:

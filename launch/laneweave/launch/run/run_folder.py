@@ -41,7 +41,8 @@ FOLDER_RULE = "a new or empty folder"
 def new_folder(out: Path | None, settings: Scenario, method: str) -> Iterator[Path]:
     """Yield a new or empty folder, or one that only an interrupted start has left behind.
 
-    If the run is rejected, or interrupted before it writes results, the folder is as before.
+    If the run is rejected, or interrupted before it writes results, the folder is as before,
+    but without what an interrupted start had left.
 
     Raises:
         BadInputError: the folder is not empty, is used by another run, or cannot be created.
@@ -122,14 +123,15 @@ def _is_unused(folder: Path) -> bool:
     Raises:
         OSError: the folder or a file cannot be read.
     """
-    if not EARLY_FILES.issuperset(path.name for path in folder.iterdir()):
+    names = {path.name for path in folder.iterdir()}
+    if EVENTS_FILE not in names:
+        return names <= {LOG_FILE}
+    if not names <= EARLY_FILES:
         return False
-    events = folder / EVENTS_FILE
-    if events.exists():
-        for line in events.read_text(encoding="utf-8", errors="replace").splitlines():
-            with contextlib.suppress(ValueError, KeyError, TypeError):
-                if json.loads(line)["kind"] == ENTERED:
-                    return False
+    for line in (folder / EVENTS_FILE).read_text("utf-8", "replace").splitlines():
+        with contextlib.suppress(ValueError, KeyError, TypeError):
+            if json.loads(line)["kind"] == ENTERED:
+                return False
     if not (folder / SUMMARY_FILE).exists():
         return True
     summary = read_summary(folder)

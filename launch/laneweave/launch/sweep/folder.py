@@ -24,12 +24,11 @@ from typing import Self
 from attrs import evolve
 
 from laneweave.launch.recordings.files import TRIPS_FILE
-from laneweave.launch.recordings.results_over_seeds import flatten, write_results
+from laneweave.launch.recordings.results_over_seeds import write_results
 from laneweave.launch.recordings.runs import SWEEP_FILE, Run, sweep_runs, write_point
-from laneweave.launch.run_methods import REFERENCE_METHODS, affects, labelled
+from laneweave.launch.run_methods import REFERENCE_METHODS, labelled
 from laneweave.launch.sweep.execution import LOG_FILE, PointResult, kept_files
 from laneweave.launch.sweep.points import Point, with_volume
-from laneweave.protocol.config.scenario_files import to_tables
 from laneweave.protocol.errors import BadInputError, CommandFailedError
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.summary import read_summary
@@ -103,12 +102,12 @@ class SweepFolder:
                 allowed = f"{run.plug_in}, which made {self.out / name}; or a new folder"
                 raise BadInputError(f"version of {run.label}", installed, allowed)
             wanted = evolve(with_volume(base, run.volume_veh_per_lane_h), seed=run.scenario.seed)
-            expected = flatten(to_tables(method.settings(wanted)), ".")
-            recorded = flatten(to_tables(run.scenario), ".")
+            expected = evolve(run, scenario=method.settings(wanted)).settings
+            recorded = run.settings
             where = f"as recorded in {self.out / name}; other settings require a new folder"
             for field in dict.fromkeys([*recorded, *expected]):
                 value, own = recorded.get(field), expected.get(field)
-                if value != own and affects(field, run.method):
+                if value != own:
                     raise BadInputError(field, own, f"{value}, {where}")
 
     def is_finished(self, point: Point) -> bool:

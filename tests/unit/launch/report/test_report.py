@@ -163,6 +163,20 @@ def test_runs_that_failed_are_listed_and_not_averaged(swept: Path, tmp_path: Pat
     assert {row[1] for row in traffic.rows} == {"1600"}
 
 
+@pytest.mark.slow
+def test_trips_may_be_older_than_trajectories(
+    laneweave: Here, swept: Path, tmp_path: Path
+) -> None:
+    """As in a run that was killed between two saves."""
+    folder = tmp_path / "run"
+    shutil.copytree(swept / "formation-1600-1", folder)
+    trips = pq.read_table(folder / "trips.parquet")
+    pq.write_table(trips.slice(0, trips.num_rows // 2), folder / "trips.parquet")
+    assert laneweave("report", folder)[0] == 0
+    for format_ in ("csv", "fcd", "mcap"):
+        assert laneweave("export", folder, "--format", format_)[0] == 0
+
+
 def test_one_line_says_what_is_wrong(
     laneweave: Here, swept: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -81,7 +81,10 @@ def test_what_an_interrupted_start_has_left_is_used_again(
 
 
 def test_results_and_files_of_others_are_never_removed(tmp_path: Path) -> None:
-    recorded, complete, foreign, broken = (tmp_path / name for name in "abcd")
+    recorded, complete, foreign, broken, copied = (tmp_path / name for name in "abcde")
+    copied.mkdir()
+    for name in ("trips.parquet", "trajectories.parquet", "ticks.parquet"):
+        (copied / name).touch()
     write_events(recorded, "leader", "entered")
     for folder in (complete, foreign, broken):
         write_events(folder)
@@ -89,7 +92,7 @@ def test_results_and_files_of_others_are_never_removed(tmp_path: Path) -> None:
     (foreign / "notes.txt").touch()
     (broken / "summary.json").touch()
     assert refusal(foreign / "notes.txt").endswith("a new or empty folder")
-    for folder in (recorded, complete, foreign, broken):
+    for folder in (recorded, complete, foreign, broken, copied):
         before = sorted(folder.iterdir())
         assert refusal(folder).endswith("a new or empty folder")
         assert sorted(folder.iterdir()) == before

@@ -12,6 +12,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from laneweave.launch.run_methods import affects
+from laneweave.protocol.config.scenario_files import to_tables
+from laneweave.protocol.scenario.fields import Scenario
 from support.commands import Here
 from support.sharing import made_once
 from support.sweeping import command, results, short_road, sweep
@@ -166,10 +168,26 @@ def test_settings_that_do_not_affect_a_method_may_differ(whole: Path, tmp_path: 
         ("rule.gap", "formation", False),
         ("road.s3_m", "rule", True),
         ("seed", "lc2013", True),
+        ("entrance", "rule", True),
+        ("exit", "lc2013", True),
+        ("vehicle_type", "lc2013", True),
     ],
 )
 def test_which_settings_affect_a_method(field: str, method: str, matters: bool) -> None:
     assert affects(field, method) is matters
+
+
+def test_settings_affect_a_method_unless_it_is_known_not_to_read_them() -> None:
+    """Reference methods do not read the settings of formation control and of other methods."""
+    ignored = {
+        "formation": {"rule", "lc2013"},
+        "rule": {"lc2013", "formation", "sensing", "braking", "tracking", "network", "radio"},
+        "lc2013": {"rule", "formation", "sensing", "braking", "tracking", "network", "radio"},
+    }
+    tables = set(to_tables(Scenario()))
+    for method, names in ignored.items():
+        without_effect = {name for name in tables if not affects(name, method)}
+        assert without_effect == names | {"security", "service", "observation"}
 
 
 def test_other_folders_are_refused(laneweave: Here, scenario: Path, tmp_path: Path) -> None:
