@@ -16,7 +16,7 @@ from attrs import frozen
 
 from evaluation.evidence import Evidence, read_evidence, setting_of, write_evidence
 from evaluation.pictures import draw_pictures
-from evaluation.points import JAMMED, Key, run_rows
+from evaluation.points import JAMMED, Key, SeedKey, run_rows
 from evaluation.programme import FORMATIONS, points_of
 from evaluation.trials import (
     TRIALS,
@@ -175,7 +175,7 @@ def collect(
     sweeps: Iterable[Path],
     labels: Collection[str],
     images: Path,
-    needed: Collection[Key] = (),
+    needed: Collection[SeedKey] = (),
 ) -> Evidence:
     """Return the evidence of the existing runs, and draw their figures.
 
@@ -226,15 +226,15 @@ def refresh(
         sweeps: as in `collect`.
         labels: as in `collect`.
         docs: folder of the documents.
-        add_runs: keep recorded runs of other seeds and volumes, and figures that show recorded
-            points without new runs.
+        add_runs: keep recorded runs of other seeds and volumes, and figures that show some of
+            them (`draw_pictures`).
 
     Raises:
         BadInputError, OSError, ValueError, KeyError: as in `collect`.
     """
     path = docs / "evidence" / "evaluation.json"
     recorded = read_evidence(path)
-    needed = recorded.by_key if add_runs else ()
+    needed = [(*row.key, row.seed) for row in recorded.runs] if add_runs else ()
     new = collect(out, sweeps, labels, docs / "images", needed)
     evidence = recorded.updated_with(new, add_runs=add_runs)
     write_evidence(evidence, path)

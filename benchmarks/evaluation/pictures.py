@@ -9,7 +9,7 @@ from typing import Final
 from attrs import frozen
 
 from evaluation.evidence import Picture
-from evaluation.points import Key
+from evaluation.points import SeedKey
 from evaluation.programme import LABELS, VOLUMES
 from evaluation.statements import PAPER_STRETCH_M, PAPER_VOLUMES
 from laneweave.launch.recordings.runs import Comparison, Run
@@ -40,32 +40,37 @@ class _Figure:
 
 
 def draw_pictures(
-    runs: Sequence[Run], folder: Path, needed: Collection[Key] = ()
+    runs: Sequence[Run], folder: Path, needed: Collection[SeedKey] = ()
 ) -> tuple[Picture, ...]:
     """Draw figures, and return those drawn.
 
     Args:
         runs: runs of the sweep; failed ones are excluded.
         folder: folder of the figures.
-        needed: points that a figure must not lose: one that has no run at one of its needed points
-            is not drawn.
+        needed: runs that a figure must not lose. It is not drawn without one of those that it
+            shows; if it needs trajectories, without a run of the same label and volume.
     """
     drawn = []
-    present = {(run.label, run.volume_veh_per_lane_h) for run in runs}
-    missing = set(needed) - present
     for figure in _FIGURES:
-        if any(figure.shows(*point) for point in missing):
-            continue
         chosen = Comparison.of(
             run
             for run in runs
             if figure.shows(run.label, run.volume_veh_per_lane_h)
             and (run.has_trajectories or not figure.traced)
         )
-        if chosen.runs:
+        found = [_seed_key(run) for run in (*chosen.runs, *chosen.failed)]
+        # Few runs keep their trajectories.
+        parts = 2 if figure.traced else 3
+        have = {key[:parts] for key in found}
+        missing = (key for key in needed if figure.shows(*key[:2]) and key[:parts] not in have)
+        if chosen.runs and not any(missing):
             figure.draw(chosen, folder / figure.picture.name, DPI)
             drawn.append(figure.picture)
     return tuple(drawn)
+
+
+def _seed_key(run: Run) -> SeedKey:
+    return run.label, run.volume_veh_per_lane_h, run.scenario.seed
 
 
 def _draw_snapshots(comparison: Comparison, out: Path, dpi: int) -> None:
@@ -78,7 +83,7 @@ def _draw_spacings(comparison: Comparison, out: Path, dpi: int) -> None:
         run = comparison.representative(label, SHOWN_VOLUME)
         if run is not None:
             counted[label, SHOWN_VOLUME] = count(read_tracks(run.folder), run.scenario)
-    draw_spacings(counted, comparison.runs[0].scenario, out, dpi)
+    draw_spacings(counted, [run.scenario for run in comparison.runs], out, dpi)
 
 
 def _snapshots(label: str, description: str) -> _Figure:

@@ -33,6 +33,8 @@ SOLVER: Final = {PLAN_MADE: "branching", STREAM_PLANNED: "rolling"}
 """The solver of plans whose events do not name it, by kind of event."""
 Key = tuple[str, float]
 """(label, volume in vehicles/(lane h))."""
+SeedKey = tuple[str, float, int]
+"""(label, volume in vehicles/(lane h), seed)."""
 
 
 @frozen
@@ -259,7 +261,7 @@ def check_comparable(runs: Sequence[Run]) -> None:
     Raises:
         BadInputError: they differ in road or demand, or one occurs twice.
     """
-    seen: set[tuple[str, float, int]] = set()
+    seen: set[SeedKey] = set()
     for run in runs:
         first, own = runs[0].scenario, run.scenario
         if own.road != first.road:

@@ -25,7 +25,7 @@ from attrs import frozen
 from laneweave.launch.recordings.runs import scenario_of
 from laneweave.launch.sweep.execution import StoppedError, wait_for_exit
 from laneweave.protocol.errors import CommandFailedError
-from laneweave.protocol.summary import RunSummary, read_summary
+from laneweave.protocol.summary import Ending, RunSummary, read_summary
 
 ZENOH_VOLUMES: Final = (1000, 1600, 2000)
 """Volumes that are repeated over Zenoh, in vehicles/(lane h)."""
@@ -101,9 +101,14 @@ class Trial:
     options: tuple[str, ...]
     """Options of `laneweave run`."""
     ending: str = "complete"
-    """Expected ending in summary.json; a run with another ending has failed."""
+    """Expected ending in summary.json; a run with another ending, or with overlaps, has failed."""
     is_shared: bool = False
     """Whether other trials may run at the same time; the trial's times are not evaluated."""
+
+    @property
+    def status(self) -> int:
+        """Expected exit status of the command."""
+        return 0 if self.ending == Ending.COMPLETE.value else 1
 
     @property
     def command(self) -> str:
@@ -183,7 +188,7 @@ def run_trial(trial: Trial, out: Path, root: Path, stopped: Callable[[], bool]) 
         stopped: returns whether the evaluation was stopped.
 
     Raises:
-        CommandFailedError: the run failed or timed out.
+        CommandFailedError: the run failed, violated a guarantee, or timed out.
         StoppedError: the evaluation was stopped, and the run with it.
     """
     folder = out.resolve() / trial.part / trial.name
@@ -212,10 +217,14 @@ def run_trial(trial: Trial, out: Path, root: Path, stopped: Callable[[], bool]) 
             raise CommandFailedError(late) from error
         output.seek(0)
         message = " ".join(output.read().decode(errors="replace").split())
-    summary = read_summary(folder)
-    if summary is None or summary.ending != trial.ending:
+    if process.returncode != trial.status or not _ended_as_expected(trial, folder):
         raise CommandFailedError(f"{trial.command}: status {process.returncode}: {message[-400:]}")
     (folder / COMMAND_FILE).write_text(json.dumps(trial.options), encoding="utf-8")
+
+
+def _ended_as_expected(trial: Trial, folder: Path) -> bool:
+    summary = read_summary(folder)
+    return summary is not None and summary.ending == trial.ending and not summary.safety.overlaps
 
 
 def is_finished(trial: Trial, out: Path) -> bool:

@@ -20,7 +20,7 @@ def write_atomically(path: Path, write: str | Callable[[Path], object]) -> None:
         write: its text, or a function that writes its content to a given path.
 
     Raises:
-        OSError: the disk is full, or fails; the file is as before.
+        OSError: the disk is full, or fails; the file is as before, and the error names it.
     """
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
@@ -29,8 +29,10 @@ def write_atomically(path: Path, write: str | Callable[[Path], object]) -> None:
         else:
             write(part)
         part.replace(path)
-    except BaseException:
+    except BaseException as error:
         part.unlink(missing_ok=True)
+        if isinstance(error, OSError):
+            error.filename = str(path)
         raise
 
 

@@ -359,6 +359,18 @@ class RunSummary:
     folder: Path | None = field(default=None, eq=False, metadata={IN_FILE: False})
     """Folder of the run, which is not part of the file."""
 
+    def not_left(self, *, of_sumo: bool) -> int:
+        """Return how many vehicles have not left the road, though they should have.
+
+        Args:
+            of_sumo: whether vehicles come from a SUMO simulation. Then a complete run may leave
+                some outside: SUMO drives them elsewhere, or their exits are full.
+        """
+        outside_allowed = of_sumo and self.ending == Ending.COMPLETE.value
+        vehicles = self.vehicles
+        expected = vehicles.entered if outside_allowed else vehicles.demanded
+        return max(0, expected - vehicles.left)
+
     @classmethod
     def from_json(cls, data: object) -> RunSummary:
         """Read a summary from a JSON object.

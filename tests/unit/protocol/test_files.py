@@ -47,8 +47,9 @@ def test_what_ends_writing_leaves_the_file_as_it_was(
         part.write_text("half", encoding="utf-8")
         raise error
 
-    with pytest.raises(error):
+    with pytest.raises(error) as failed:
         write_atomically(path, fail)
+    assert getattr(failed.value, "filename", str(path)) == str(path)
     assert [*tmp_path.iterdir()] == [path]
     assert path.read_text(encoding="utf-8") == "first"
 

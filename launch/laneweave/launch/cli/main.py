@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 TYPER_INTERRUPTED = 130
 """Exit status of typer after Ctrl-C."""
+_DISK_FAILURES = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO)
 MAX_LINES = 20
 """Maximum number of errors of a file that are printed."""
 SIM_HINT = "the simulation packages: install laneweave[sim]"
@@ -124,6 +125,9 @@ def _status(arguments: list[str]) -> int:
         sys.stderr.write(" ".join(str(error).split()) + "\n")
         return 1
     except (OSError, ModuleNotFoundError) as error:
+        if isinstance(error, OSError) and error.errno in _DISK_FAILURES:
+            sys.stderr.write(f"{error.filename or 'a file'}: {error.strerror}\n")
+            return 1
         problem = _problem(error)
         if problem is None:
             raise

@@ -111,7 +111,8 @@ def tune(
         write_atomically(folder / TUNING_FILE, json.dumps(result, indent=1) + "\n")
         _print(Console(), folder, scores, sets[scores[0].label])
     if math.isinf(scores[0].score_s):
-        raise CommandFailedError(f"in no set, all vehicles left the road: see {folder}")
+        why = "runs fail, vehicles stay on the road, or no vehicle is counted"
+        raise CommandFailedError(f"with every set {why}: see {folder}")
 
 
 def _record(score: Score, method: LabelledMethod) -> dict[str, object]:

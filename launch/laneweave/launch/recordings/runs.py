@@ -106,7 +106,7 @@ class Comparison:
         Runs of a label that differ in more than volume and seed, or have other faults, are not
         averaged: they get other labels, which contain their folder or that of their sweep.
         """
-        all_runs = list({(run.folder.resolve(), run.label): run for run in runs}.values())
+        all_runs = list({(run.folder.resolve(), run.order): run for run in runs}.values())
         listed = all_runs
         for name in (_last_part, str):
             alike = _labels_of_like_runs(listed)

@@ -154,18 +154,28 @@ SHOWN_SHARE = 1.3
 """Upper limit of the axis, as a multiple of the limit of the quantity."""
 
 
-def draw_spacings(counted: Counted, scenario: Scenario, out: Path, dpi: int) -> None:
-    """Draw spacings and time headways: a row per quantity, a column per volume."""
-    _draw(counted, (SPACING, HEADWAY), scenario, out, dpi)
+def draw_spacings(counted: Counted, scenarios: Sequence[Scenario], out: Path, dpi: int) -> None:
+    """Draw spacings and time headways: a row per quantity, a column per volume.
+
+    Dashed lines show the nominal values in the scenarios.
+    """
+    _draw(counted, (SPACING, HEADWAY), scenarios, out, dpi)
 
 
-def draw_comfort(counted: Counted, scenario: Scenario, out: Path, dpi: int) -> None:
-    """Draw decelerations, jerks and lateral accelerations in the same layout."""
-    _draw(counted, (DECELERATION, JERK, LATERAL), scenario, out, dpi)
+def draw_comfort(counted: Counted, scenarios: Sequence[Scenario], out: Path, dpi: int) -> None:
+    """Draw decelerations, jerks and lateral accelerations in the same layout.
+
+    Dashed lines show the limits in the scenarios.
+    """
+    _draw(counted, (DECELERATION, JERK, LATERAL), scenarios, out, dpi)
 
 
 def _draw(
-    counted: Counted, quantities: Sequence[Quantity], scenario: Scenario, out: Path, dpi: int
+    counted: Counted,
+    quantities: Sequence[Quantity],
+    scenarios: Sequence[Scenario],
+    out: Path,
+    dpi: int,
 ) -> None:
     labels = list(dict.fromkeys(label for label, _ in counted))
     volumes = spread_evenly(sorted({volume for _, volume in counted}))
@@ -187,10 +197,11 @@ def _draw(
                     style["linewidth"] = widths[label]
                     _draw_one(axes, counted[label, volume], quantity, style)
             _explain_missing(axes, counted, quantity, volume, labels)
-            value = _set_value(quantity, scenario)
-            axes.axvline(value, zorder=1, **REFERENCE)
+            values = {_set_value(quantity, scenario) for scenario in scenarios}
+            for value in sorted(values):
+                axes.axvline(value, zorder=1, **REFERENCE)
             if quantity.exceedance:
-                axes.set_xlim(0.0, min(1.05 * quantity.edges[-1], SHOWN_SHARE * value))
+                axes.set_xlim(0.0, min(1.05 * quantity.edges[-1], SHOWN_SHARE * max(values)))
             axes.set_xlabel(f"{quantity.name} ({quantity.unit})")
             if volume == volumes[0]:
                 share = "time with more" if quantity.exceedance else "samples with less"

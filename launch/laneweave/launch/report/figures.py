@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
-from attrs import frozen
+from attrs import evolve, frozen
 
 from laneweave.launch.drawing.colours import CLOSED_FILL
 from laneweave.launch.drawing.figures import INK
@@ -251,21 +251,34 @@ def _draw_seeds(axes: Axes, comparison: Comparison, value: Callable[[Run], float
 
 
 def draw_speeds(comparison: Comparison, out: Path, dpi: int) -> None:
-    """Draw the mean speed over space and time, in a panel per label and volume.
+    """Draw the mean speed over space and time, in a panel per label and volume with trajectories.
 
-    Colours diverge from v_F, with one scale for all panels: the difference from v_F has a
-    square-root scale, so that small waves show beside jams. On each side of v_F it ends at the
-    percentile `LIMIT_PERCENT` of the bins on that side; the ends of the bar are for bins beyond it.
+    If v_F is not the same in all runs, speeds are relative to it. Colours diverge from v_F, with
+    one scale for all panels: the difference from v_F has a square-root scale, so that small waves
+    show beside jams. On each side of v_F it ends at the percentile `LIMIT_PERCENT` of the bins on
+    that side; the ends of the bar are for bins beyond it.
     """
-    labels, volumes = comparison.labels, spread_evenly(comparison.volumes)
+    labels = comparison.labels
+    traced = {run.volume_veh_per_lane_h for run in comparison.runs if run.has_trajectories}
+    volumes = spread_evenly(sorted(traced))
     shown = {
         (label, volume): comparison.representative(label, volume)
         for label in labels
         for volume in volumes
     }
     maps = {key: mean_speeds(run) for key, run in shown.items() if run is not None}
-    set_mps = next(run.scenario.formation.speed_mps for run in shown.values() if run is not None)
-    norm, ticks = speed_scale(maps.values(), set_mps)
+    own_mps = {
+        key: run.scenario.formation.speed_mps for key, run in shown.items() if run is not None
+    }
+    set_speed, *others = set(own_mps.values())
+    unit, white = "m/s", f" = {set_speed:g} m/s"
+    if others:
+        set_speed, unit, white = 100.0, "% of $v_F$", ""
+        maps = {
+            key: evolve(one, speed_mps=one.speed_mps * (100.0 / own_mps[key]))
+            for key, one in maps.items()
+        }
+    norm, ticks = speed_scale(maps.values(), set_speed)
     width_in, height_in = 1.5 + 2.05 * max(2, len(volumes)), 0.75 + 1.75 * len(labels)
     with picture(width_in, height_in, out, dpi) as figure:
         panels = figure.subplots(len(labels), len(volumes), sharex=True, sharey=True, squeeze=False)
@@ -303,7 +316,7 @@ def draw_speeds(comparison: Comparison, out: Path, dpi: int) -> None:
         bar = figure.colorbar(mesh, ax=panels, pad=0.012, extendfrac=0.04, **style)
         bar.set_ticks(ticks, labels=[f"{one:.4g}" for one in ticks])
         bar.minorticks_off()
-        bar.set_label(f"mean speed (m/s)\nwhite: $v_F$ = {set_mps:g} m/s")
+        bar.set_label(f"mean speed ({unit})\nwhite: $v_F${white}")
 
 
 def speed_scale(maps: Iterable[MeanSpeeds], set_mps: float) -> tuple[FuncNorm, list[float]]:

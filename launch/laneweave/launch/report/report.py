@@ -233,7 +233,7 @@ def _sections(comparison: Comparison, report: _Report, formation: int | None) ->
         report.sections.append(Section("Snapshots", pictures=pictures))
         if example and driven:
             _add_path_map(report, driven, example[0].title)
-        _add_distributions(report, comparison, busiest[0])
+        _add_distributions(report, comparison)
     return report.sections
 
 
@@ -306,9 +306,10 @@ def _add_path_map(report: _Report, driven: DrivenMap, title: str) -> None:
     )
 
 
-def _add_distributions(report: _Report, comparison: Comparison, example: Run) -> None:
+def _add_distributions(report: _Report, comparison: Comparison) -> None:
     """Add the distributions over all runs with trajectories; read one run at a time."""
     counted: dict[tuple[str, float], distributions.Counts] = {}
+    scenarios = [run.scenario for run in comparison.runs if run.has_trajectories]
     for run in comparison.runs:
         if run.has_trajectories:
             key = (run.label, run.volume_veh_per_lane_h)
@@ -317,14 +318,14 @@ def _add_distributions(report: _Report, comparison: Comparison, example: Run) ->
     report.add(
         "Spacings and time headways",
         "spacing.png",
-        partial(distributions.draw_spacings, counted, example.scenario),
+        partial(distributions.draw_spacings, counted, scenarios),
         SPACING_CAPTION,
         "Cumulative distributions of spacing and time headway",
     )
     report.add(
         "Deceleration and comfort",
         "comfort.png",
-        partial(distributions.draw_comfort, counted, example.scenario),
+        partial(distributions.draw_comfort, counted, scenarios),
         COMFORT_CAPTION,
         "Shares of driving time above each deceleration, jerk and lateral acceleration",
     )

@@ -167,8 +167,7 @@ def _violations(summary: RunSummary, *, interrupted: bool, of_sumo: bool) -> lis
     Args:
         summary: summary of the run.
         interrupted: whether a signal or a fault has ended the run, which is then not complete.
-        of_sumo: whether vehicles come from a SUMO simulation. Then a complete run may leave some
-            outside: SUMO drives them elsewhere, or their exits are full.
+        of_sumo: as in `RunSummary.not_left`.
     """
     vehicles, safety = summary.vehicles, summary.safety
     found = []
@@ -178,13 +177,10 @@ def _violations(summary: RunSummary, *, interrupted: bool, of_sumo: bool) -> lis
         found.append(f"the run is recorded until {summary.recorded_until_s:g} s: the disk failed")
     if interrupted:
         return found
-    complete = summary.ending == Ending.COMPLETE.value
-    if not complete:
+    if summary.ending != Ending.COMPLETE.value:
         limit = " (runtime.max_road_s)" if summary.ending == Ending.LIMIT.value else ""
         found.append(f"the run is not complete: {summary.ending}{limit}")
-    expected = vehicles.entered if complete and of_sumo else vehicles.demanded
-    if vehicles.left < expected:
-        missing = expected - vehicles.left
+    if missing := summary.not_left(of_sumo=of_sumo):
         found.append(f"{missing} of {vehicles.demanded} vehicles did not leave the road")
     if vehicles.missed_exits and summary.faults is None and summary.method == FORMATION:
         found.append(f"{vehicles.missed_exits} of {vehicles.left} vehicles missed their exits")

@@ -73,8 +73,18 @@ class ReferenceRun:
             KeyboardInterrupt: a signal has stopped the run before it began.
         """
         self.folder.mkdir(parents=True, exist_ok=True)
+        with stop_signals(self._request_stop):
+            problem = self._drive()
+            return complete_summary(
+                self.folder,
+                problems=() if problem is None else (problem,),
+                interrupted=self._stop,
+                processes=1,
+            )
+
+    def _drive(self) -> str | None:
+        """Drive until the end; return a line if the run has failed."""
         with (
-            stop_signals(self._request_stop),
             temporary_folder("sumo") as folder,
             reference_method(self.method).open(self.scenario, folder) as traffic,
             RunProgress(self.scenario, show=self.show_progress) as progress,
@@ -92,12 +102,7 @@ class ReferenceRun:
             finally:
                 stopped = Ending.INTERRUPTED if problem is None else Ending.STANDSTILL
                 record.close(road.t_s, road.ending or stopped)
-        return complete_summary(
-            self.folder,
-            problems=() if problem is None else (problem,),
-            interrupted=self._stop,
-            processes=1,
-        )
+        return problem
 
     def _request_stop(self) -> None:
         self._stop = True

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -36,6 +36,7 @@ from laneweave.protocol.wire.messages import Census, Name
 from laneweave.protocol.wire.topics import Party
 from laneweave.sim_bridge.core import BridgeCore, TickPhase
 from laneweave.sim_bridge.recording.run_record import RunRecord
+from laneweave.sim_bridge.road.obstacles import Breakdown
 from laneweave.sim_bridge.road_sources import RunDemand, demand_of, open_road
 
 STALL_S = 600.0
@@ -155,8 +156,13 @@ class SimulatedRun:
         self.folder.mkdir(parents=True, exist_ok=True)
         network = SimulatedNetwork(scenario.seed, self.conditions, skip_codec=True)
         self._roles = SimulatedRoles(network, coordinator_names(scenario), self._start)
+        with stop_signals(self._request_stop):
+            self._simulate(network, breakdowns)
+            return self._outcome(network.dropped + self._board.dropped)
+
+    def _simulate(self, network: SimulatedNetwork, breakdowns: Sequence[Breakdown]) -> None:
+        scenario = self.scenario
         with (
-            stop_signals(self._request_stop),
             open_road(self.demand, self.folder) as road,
             RunProgress(scenario, show=self.show_progress) as progress,
         ):
@@ -182,13 +188,19 @@ class SimulatedRun:
             try:
                 self._drive(network, bridge, progress)
             finally:
-                killed = self._injection is not None and self._injection.end
-                record.close(bridge.t_s, Ending.UNFINISHED if killed else Ending.INTERRUPTED)
-        dropped = network.dropped + self._board.dropped
+                ending = Ending.UNFINISHED if self._end_by_faults else Ending.INTERRUPTED
+                record.close(bridge.t_s, ending)
+
+    @property
+    def _end_by_faults(self) -> str:
+        """Why the faults have ended the run; empty: they have not."""
+        return "" if self._injection is None else self._injection.end
+
+    def _outcome(self, dropped: int) -> Outcome:
         results: dict[str, Any] = {"dropped": dropped}
         if self._injection is not None:
-            if killed:
-                self._problems.append(self._injection.end)
+            if self._end_by_faults:
+                self._problems.append(self._end_by_faults)
             elif not self._stop:
                 self._problems += self._injection.unused_faults()
             results = self._injection.results(dropped)
@@ -196,7 +208,7 @@ class SimulatedRun:
             self.folder,
             problems=self._problems,
             interrupted=self._stop,
-            cut_short=bool(killed),
+            cut_short=bool(self._end_by_faults),
             processes=1,
             **results,
         )

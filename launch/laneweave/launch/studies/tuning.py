@@ -188,7 +188,7 @@ class Score:
     hard_brakes: int
     min_ttc_s: float | None
     failed: int
-    """Number of runs that failed, or in which vehicles have not left."""
+    """Number of runs in which vehicles have not left, or formation control has failed."""
 
 
 def score_of(label: str, runs: Sequence[Run]) -> Score:
@@ -218,6 +218,7 @@ def score_of(label: str, runs: Sequence[Run]) -> Score:
 
 
 def _is_complete(run: Run) -> bool:
-    if run.summary is None or run.summary.vehicles.left < run.summary.vehicles.demanded:
+    of_sumo = bool(run.scenario.sumo.config)
+    if run.summary is None or run.summary.not_left(of_sumo=of_sumo):
         return False
     return not (run.method == FORMATION and run.reason)

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
-from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-import pyarrow.parquet as pq
 import pytest
 from attrs import evolve
+from matplotlib.collections import QuadMesh
+from matplotlib.figure import Figure
 from PIL import Image
 
 from laneweave.launch.drawing.colours import CLOSED_FILL, NEUTRAL, lane_colours
@@ -39,49 +39,15 @@ from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.road_layout import ANY_LANE
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.road_tables import Closure
-from laneweave.sim_bridge.recording.driving_measures import DrivingMeasures
-from laneweave.sim_bridge.recording.trajectories import Sample, Trajectories
-from laneweave.sim_bridge.recording.trips import Trip, metadata_of, trips_table
+from laneweave.sim_bridge.recording.trips import Trip
 from laneweave.sim_bridge.road.demand import Arrival
 from support.closed_lanes import DROP
 from support.commands import loads
+from support.straight_runs import make_run, record
 from support.summaries import make_summary
 from support.tables import for_each
 from support.tracks import make_tracks
 from support.variants import variants
-
-
-def make_run(folder: Path, lanes: int = 3, vehicles: int = 12, *, lattice: bool = True) -> Path:
-    """Record vehicles that drive straight on, one per second, from 55 s on."""
-    scenario = parse_scenario({"road": {"lanes": lanes}})
-    trips = []
-    for number in range(vehicles):
-        arrival = Arrival(f"v{number}", number % lanes, number % lanes, 55.0 + number)
-        entered_s, formation = 55.5 + number, number // 6 if lattice else None
-        trips.append(Trip(arrival, entered_s, entered_s + 1000 / 15, formation, arrival.lane))
-    record(folder, scenario, trips)
-    return folder
-
-
-def record(folder: Path, scenario: Scenario, trips: Sequence[Trip]) -> None:
-    """Write the files of a run whose vehicles drive at 15 m/s on the lanes of their arrival."""
-    metadata = metadata_of(scenario)
-    folder.mkdir(exist_ok=True)
-    last_arrival_s = max((trip.arrival.t_s for trip in trips), default=0.0)
-    pq.write_table(trips_table(trips, last_arrival_s, metadata), folder / "trips.parquet")
-    path, lattice = folder / "trajectories.parquet", scenario.lattice
-    with closing(
-        Trajectories(path, metadata, lattice, DrivingMeasures(Scenario()))
-    ) as trajectories:
-        for tick in range(1300):
-            samples: list[Sample] = []
-            for number, trip in enumerate(trips):
-                s_m = 15.0 * (0.1 * tick - (trip.entered_s or 0.0))
-                if 0.0 <= s_m < 1000.0:
-                    y_m, preferred = (trip.arrival.lane + 0.5) * 3.5, trip.arrival.preferred_lane
-                    cell = (None, None) if trip.formation is None else (-number, 0)
-                    samples.append((f"v{number}", s_m, y_m, 15.0, 0.0, 0.0, *cell, preferred))
-            trajectories.tick(0.1 * tick, samples)
 
 
 def is_picture(path: Path) -> bool:
@@ -299,6 +265,49 @@ def test_the_scale_of_speeds_ends_at_a_percentile() -> None:
     assert (norm.vmin, norm.vmax) == (5.0, 16.0)
     assert ticks == pytest.approx([5.0, 10.0, 14.0, 15.0, 15.1, 15.5, 16.0])
     assert np.asarray(norm([5.0, 15.0, 16.0])) == pytest.approx([0.0, 0.5, 1.0])
+
+
+def test_speeds_at_different_v_f_are_relative_to_it(tmp_path: Path) -> None:
+    """One run drives at its v_F, the other one at three quarters of it."""
+    slow = make_run(tmp_path / "slow")
+    fast = make_run(tmp_path / "fast", formation={"speed_mps": 20.0})
+    runs = comparison(slow, fast)
+    panels: list[tuple[str, Any]] = []
+
+    def bars(figure: Figure, *_: object, **__: object) -> None:
+        drawn = [one for axes in figure.axes for one in axes.collections]
+        means = [
+            float(np.ma.asarray(one.get_array()).mean())
+            for one in drawn
+            if isinstance(one, QuadMesh)
+        ]
+        panels.append((figure.axes[-1].get_ylabel(), means))
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(Figure, "savefig", bars)
+        draw_speeds(runs, tmp_path / "heat.png", dpi=60)
+        draw_speeds(comparison(slow), tmp_path / "heat.png", dpi=60)
+    (both, means), (alone, _) = panels
+    assert both == "mean speed (% of $v_F$)\nwhite: $v_F$"
+    assert alone == "mean speed (m/s)\nwhite: $v_F$ = 15 m/s"
+    assert means[:2] == pytest.approx([75.0, 100.0])
+
+
+def test_volumes_without_trajectories_have_no_panels(tmp_path: Path) -> None:
+    """Seven volumes, of which a figure shows at most six, and trajectories at one of them."""
+    folders = [
+        make_run(tmp_path / str(number), demand={"volume_veh_per_lane_h": 900.0 + number})
+        for number in range(7)
+    ]
+    for number, folder in enumerate(folders):
+        if number != 3:
+            (folder / "trajectories.parquet").unlink()
+    runs = Comparison.of(
+        Run(folder, "formation", "formation", scenario_of(folder / "trips.parquet"), None)
+        for folder in folders
+    )
+    draw_speeds(runs, tmp_path / "heat.png", dpi=60)
+    assert is_picture(tmp_path / "heat.png")
 
 
 def test_only_sumo_moves_vehicles_from_lane_to_lane_at_once() -> None:

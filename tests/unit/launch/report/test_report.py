@@ -164,9 +164,7 @@ def test_runs_that_failed_are_listed_and_not_averaged(swept: Path, tmp_path: Pat
 
 
 @pytest.mark.slow
-def test_trips_may_be_older_than_trajectories(
-    laneweave: Here, swept: Path, tmp_path: Path
-) -> None:
+def test_trips_may_be_older_than_trajectories(laneweave: Here, swept: Path, tmp_path: Path) -> None:
     """As in a run that was killed between two saves."""
     folder = tmp_path / "run"
     shutil.copytree(swept / "formation-1600-1", folder)

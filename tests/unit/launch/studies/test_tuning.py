@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import math
+import os
 import random
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 from attrs import evolve
@@ -169,6 +172,18 @@ def test_a_set_with_a_bad_run_is_not_eligible(summary: RunSummary | None) -> Non
     assert math.isinf(score.score_s)
 
 
+def test_on_a_corridor_vehicles_may_stay_outside() -> None:
+    corridor = evolve(BASE, sumo=evolve(BASE.sumo, config="x.sumocfg"))
+    outside = summary_with(70.0, left=99)
+    outside = evolve(outside, vehicles=evolve(outside.vehicles, entered=99))
+    for scenario, summary, eligible in (
+        (corridor, outside, True), (corridor, summary_with(70.0, left=99), False),
+        (BASE, outside, False),
+    ):  # fmt: skip
+        run = evolve(run_with(1, summary), scenario=scenario)
+        assert math.isfinite(score_of("set-0001", [run]).score_s) is eligible
+
+
 @pytest.mark.parametrize(("method", "eligible"), [("lc2013", True), ("formation", False)])
 def test_overlaps_exclude_formation_control_only(method: str, *, eligible: bool) -> None:
     run = run_with(1, summary_with(60.0, overlaps=1), method)
@@ -200,6 +215,12 @@ def test_the_command_finds_prints_and_continues(laneweave: Here, tmp_path: Path)
     assert "2 of 3 runs were already finished" in errors[0]
     status, _, _ = laneweave(*command)  # those of a larger budget stay
     assert status == 0
+    full = os.strerror(errno.ENOSPC)
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(Path, "replace", Mock(side_effect=OSError(errno.ENOSPC, full)))
+        status, _, errors = laneweave(*command)
+    assert (status, Path(errors[-1]).parent) == (1, tmp_path / "found")
+    assert errors[-1].endswith(f": {full}")
     other = "sensitivity", "--method", "rule", "--out", tmp_path / "found"
     assert laneweave.refused(*other).startswith("--out")
     assert laneweave.refused("tune", "lc2014").startswith("METHOD: got 'lc2014'")
