@@ -34,7 +34,7 @@ from attrs import frozen
 
 from experiments import run_missing
 from laneweave.launch.faults.network_namespaces import PERFECT, Link
-from laneweave.launch.recordings.formations import read_events
+from laneweave.launch.recordings.events import read_events
 from laneweave.protocol.wire.events import AGENT_TOOK_OVER, CARETAKER_TOOK_OVER, LEFT
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))

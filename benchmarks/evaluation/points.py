@@ -11,7 +11,7 @@ from attrs import frozen
 
 from evaluation.intervals import Interval, interval
 from evaluation.lattice_points import lattice_spacing
-from laneweave.launch.recordings.formations import read_events
+from laneweave.launch.recordings.events import read_events
 from laneweave.launch.recordings.runs import Run
 from laneweave.launch.recordings.trajectories import Tracks, read_tracks
 from laneweave.protocol.errors import BadInputError
@@ -387,11 +387,13 @@ def trace(tracks: Tracks, scenario: Scenario) -> Traced:
 def slow_stretch(
     tracks: Tracks, scenario: Scenario
 ) -> tuple[tuple[float, float] | None, float | None, float | None]:
-    """Return the congested stretch of road (start, end) [m] and the lowest mean speeds [m/s].
+    """Return where traffic is slow, and how slow; means over bins of the road.
 
-    Speeds are means over bins of the road, from the end of the warm-up to the last arrival. The
-    first of the lowest ones is that of the road, the second that behind the place up to which
-    vehicles settle at v_F.
+    Counted is the time from the end of the warm-up to the last arrival.
+
+    Returns:
+        The congested stretch (start, end) [m]; the lowest mean speed of the road [m/s]; that of
+        the road beyond the place up to which vehicles settle at v_F [m/s]. None: there is none.
     """
     steady = (tracks.t_s >= WARM_UP_S) & (tracks.t_s <= scenario.demand.duration_s)
     bins = max(1, round(scenario.road.length_m / SLOW_BIN_M))

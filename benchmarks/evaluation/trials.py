@@ -22,6 +22,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from attrs import frozen
 
+from laneweave.launch.recordings.files import TICKS_FILE
 from laneweave.launch.recordings.runs import scenario_of
 from laneweave.launch.sweep.execution import StoppedError, wait_for_exit
 from laneweave.protocol.errors import CommandFailedError
@@ -297,7 +298,7 @@ def cost_rows(out: Path) -> list[CostRow]:
     for trial in _finished("length", out):
         folder = out / trial.part / trial.name
         summary = _summary(folder)
-        ticks = pq.read_table(folder / "ticks.parquet", columns=["on_road"])
+        ticks = pq.read_table(folder / TICKS_FILE, columns=["on_road"])
         driven = pc.sum(ticks["on_road"]).as_py() or 0
         rows.append(
             CostRow(

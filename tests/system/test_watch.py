@@ -22,7 +22,7 @@ from attrs import define, field
 from websockets.exceptions import ConnectionClosedOK
 from websockets.sync.client import connect
 
-from laneweave.launch.recordings.formations import read_events
+from laneweave.launch.recordings.events import read_events
 from laneweave.launch.recordings.trajectories import read_tracks
 from laneweave.protocol.security.connection import Access
 from laneweave.protocol.transports.zenoh.transport import ZenohTransport

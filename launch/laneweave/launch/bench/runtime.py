@@ -20,6 +20,7 @@ from rich.table import Table
 
 from laneweave.launch.faults.fault_file import load_faults
 from laneweave.launch.observe.road_view import RoadView
+from laneweave.launch.recordings.files import TICKS_FILE
 from laneweave.launch.run.local_run import LocalRun
 from laneweave.protocol.config.participants import coordinator_names
 from laneweave.protocol.config.scenario_files import load_scenario
@@ -121,7 +122,7 @@ def bench_runtime(
             watch=window.watch,
         )
         outcome = run.run().or_interrupt()
-        ticks = pq.read_table(folder / "run" / "ticks.parquet")
+        ticks = pq.read_table(folder / "run" / TICKS_FILE)
     times_s = ticks.column("t_s").to_numpy()
     measured = (times_s > window.begin_s) & (times_s <= window.end_s)
     return {

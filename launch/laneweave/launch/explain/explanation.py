@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import json
 from collections.abc import Mapping, Sequence
 from enum import StrEnum
 from pathlib import Path
@@ -12,9 +10,10 @@ from typing import Any
 import pyarrow.parquet as pq
 from attrs import frozen
 
-from laneweave.launch.explain.facts import Event, Facts, facts_of
+from laneweave.launch.explain.facts import Facts, facts_of
 from laneweave.launch.explain.reasons import reason_of
 from laneweave.launch.explain.story import StoryLine, seconds, story_of, to_dict, wanted
+from laneweave.launch.recordings.events import Event, read_events
 from laneweave.launch.recordings.files import EVENTS_FILE, TRIPS_FILE
 from laneweave.launch.recordings.runs import scenario_of
 from laneweave.protocol.errors import BadInputError, unknown_name
@@ -103,30 +102,17 @@ def _conclusion(facts: Facts) -> tuple[Fate, str, str]:
 
 
 def _events(folder: Path) -> Sequence[Event]:
-    """Return the events of a run; a last line that is being written is left out.
+    """Return the events of a run.
 
     Raises:
         BadInputError: there are none, or they cannot be read.
     """
     try:
-        lines = (folder / EVENTS_FILE).read_text(encoding="utf-8", errors="replace").splitlines()
-        events = [_parsed(line) for line in lines[:-1]]
-        if lines:
-            with contextlib.suppress(ValueError):
-                events.append(_parsed(lines[-1]))
-    except (OSError, ValueError) as error:
-        why = getattr(error, "strerror", None) or error
-        raise BadInputError(
-            "RUN", str(folder), f"the folder of a run, with {EVENTS_FILE} ({why})"
-        ) from error
-    return events
-
-
-def _parsed(line: str) -> Event:
-    event = json.loads(line)
-    if not isinstance(event, dict) or not {"t_s", "kind"} <= event.keys():
-        raise ValueError("a line is not an event")
-    return event
+        return list(read_events(folder, required=True))
+    except BadInputError as error:
+        why = getattr(error.__cause__, "strerror", None) or error.__cause__
+        allowed = f"the folder of a run, with {EVENTS_FILE} ({why})"
+        raise BadInputError("RUN", str(folder), allowed) from error
 
 
 def _trips(folder: Path) -> Mapping[str, None]:

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from typing import Any
 
 from attrs import define, field
 
-from laneweave.launch.recordings.closed_parts import ClosedPart, ClosedParts
+from laneweave.launch.recordings.closed_parts import RecordedClosure, RecordedClosures
+from laneweave.launch.recordings.events import Event
 from laneweave.protocol.road_layout import ANY_LANE
 from laneweave.protocol.wire import events as kinds
-
-Event = Mapping[str, Any]
 
 _OF_VEHICLE = frozenset(
     (
@@ -124,7 +122,7 @@ class Facts:
     """The last time without an agent of every vehicle that has had one."""
     never_attended: bool = False
     """Whether its agent did not start in time."""
-    closed: ClosedParts = field(factory=ClosedParts)
+    closed: RecordedClosures = field(factory=RecordedClosures)
     """Closed parts that began before the end of the facts."""
     refused: list[Event] = field(factory=list)
     """Processes whose settings were refused."""
@@ -136,12 +134,12 @@ class Facts:
     """Time of the last event of the run up to its departure."""
 
     @property
-    def breakdown(self) -> ClosedPart | None:
+    def breakdown(self) -> RecordedClosure | None:
         """Its own breakdown, if it has had one: the newest."""
         newest_first = reversed(self.closed.parts)
         return next((one for one in newest_first if self._is_own(one)), None)
 
-    def closed_between(self, since_s: float, until_s: float) -> list[ClosedPart]:
+    def closed_between(self, since_s: float, until_s: float) -> list[RecordedClosure]:
         """Return the parts that were closed in lanes that it had or wanted, in some time."""
         lanes = [
             int(event[key])
@@ -158,7 +156,7 @@ class Facts:
             and one.meets(since_s, until_s)
         ]
 
-    def stopped_before(self, event: Event) -> ClosedPart | None:
+    def stopped_before(self, event: Event) -> RecordedClosure | None:
         """Return the closed part before which it stopped, with its event `left-lattice`."""
         t_s = float(event["t_s"])
         found = [
@@ -170,7 +168,7 @@ class Facts:
         others = (one for one in reversed(found) if not self._is_own(one))
         return next(own, next(others, None))
 
-    def _is_own(self, part: ClosedPart) -> bool:
+    def _is_own(self, part: RecordedClosure) -> bool:
         """Return whether a part is closed because the vehicle itself has broken down."""
         return part.first.get("vehicle") == self.vehicle
 

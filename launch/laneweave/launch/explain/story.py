@@ -8,8 +8,9 @@ from typing import Any
 
 from attrs import frozen
 
-from laneweave.launch.explain.facts import LEADER_LOST, Event, Facts
-from laneweave.launch.recordings.closed_parts import ClosedPart
+from laneweave.launch.explain.facts import LEADER_LOST, Facts
+from laneweave.launch.recordings.closed_parts import RecordedClosure
+from laneweave.launch.recordings.events import Event
 from laneweave.protocol.names import first_names
 from laneweave.protocol.road_layout import ANY_LANE, END_OF_ROAD
 from laneweave.protocol.wire import events as kinds
@@ -144,7 +145,7 @@ def _stops(facts: Facts, event: Event) -> str:
     return f"stops before {described(part)}"
 
 
-def described(part: ClosedPart) -> str:
+def described(part: RecordedClosure) -> str:
     """Return a description of a closed part and of its cause."""
     event = part.newest
     lane, vehicle = event["lane"], event.get("vehicle")

@@ -43,8 +43,7 @@ from foxglove.messages import (
 from laneweave.launch.drawing.colours import NEUTRAL, lane_colours
 from laneweave.launch.export.recording import Recording
 from laneweave.launch.export.road_parts import road_parts
-from laneweave.launch.recordings.files import EVENTS_FILE, reading
-from laneweave.launch.recordings.formations import read_events
+from laneweave.launch.recordings.events import read_events
 from laneweave.protocol.files import write_atomically
 
 MCAP_FILE: Final = "run.mcap"
@@ -84,10 +83,7 @@ def write_mcap(
         OSError: the file cannot be written.
     """
     first_s, last_s = -math.inf if from_s is None else from_s, math.inf if to_s is None else to_s
-    with reading(recording.folder, EVENTS_FILE):
-        events = [
-            one for one in read_events(recording.folder) if first_s <= float(one["t_s"]) <= last_s
-        ]
+    events = [one for one in read_events(recording.folder) if first_s <= one["t_s"] <= last_s]
 
     def write(part: Path) -> None:
         with part.open("wb", buffering=0) as file:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,8 @@ import pyarrow.parquet as pq
 from attrs import frozen
 
 from laneweave.launch.explain.explanation import Explanation, explain
-from laneweave.launch.recordings.files import EVENTS_FILE, TRIPS_FILE, not_a_run, reading
+from laneweave.launch.recordings.events import read_events
+from laneweave.launch.recordings.files import TICKS_FILE, TRIPS_FILE, not_a_run, reading
 from laneweave.launch.recordings.runs import scenario_of
 from laneweave.launch.recordings.trajectories import read_trajectories
 from laneweave.protocol.errors import unknown_name
@@ -61,7 +62,7 @@ class RecordedRun:
         Raises:
             BadInputError: the file cannot be read; sweeps do not keep it.
         """
-        return self._table("ticks.parquet")
+        return self._table(TICKS_FILE)
 
     def events(self, kind: str | None = None) -> list[dict[str, Any]]:
         """Return the events in the order of time: `t_s`, `kind`, and the data of their kind.
@@ -73,12 +74,9 @@ class RecordedRun:
             BadInputError: the file cannot be read, or the run has no such event and this release no
                 such kind.
         """
-        with (
-            reading(self.folder, EVENTS_FILE),
-            (self.folder / EVENTS_FILE).open(encoding="utf-8") as lines,
-        ):
-            events = map(json.loads, lines)
-            found = [event for event in events if kind is None or event["kind"] == kind]
+        kinds = () if kind is None else (kind,)
+        events = read_events(self.folder, *kinds, required=True)
+        found = [dict(event) for event in sorted(events, key=itemgetter("t_s"))]
         # Plug-ins and other releases have kinds of their own.
         if not found and kind is not None and kind not in FIELDS:
             raise unknown_name("kind", kind, FIELDS)

@@ -3,28 +3,25 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 from attrs import define, field, frozen
 
+from laneweave.launch.recordings.events import Event, read_events
 from laneweave.launch.recordings.files import EVENTS_FILE, reading
-from laneweave.launch.recordings.formations import read_events
 from laneweave.protocol.wire.events import PART_CLOSED, PART_OPENED
 from laneweave.protocol.wire.obstacle_messages import PASSING
 
-Event = Mapping[str, Any]
-
 
 @define
-class ClosedPart:
+class RecordedClosure:
     """A part of a lane that was closed for a time, or a vehicle of another system there."""
 
     first: Event
     """The event `part-closed` with which it began."""
     newest: Event
-    """The newest one, which may know better where the part ends."""
+    """The newest event of the part; its `to_m` replaces that of `first`."""
     until_s: float = math.inf
     """Infinite: it was not opened again."""
 
@@ -39,13 +36,13 @@ class ClosedPart:
 
 
 @define
-class ClosedParts:
+class RecordedClosures:
     """All parts of a run, in the order in which they began."""
 
-    parts: list[ClosedPart] = field(factory=list)
+    parts: list[RecordedClosure] = field(factory=list)
 
     @property
-    def active(self) -> Iterator[ClosedPart]:
+    def active(self) -> Iterator[RecordedClosure]:
         """Those that are closed when the events end."""
         return (one for one in self.parts if math.isinf(one.until_s))
 
@@ -59,7 +56,7 @@ class ClosedParts:
                 known.until_s = float(event["t_s"])
             return opens
         if not opens:
-            self.parts.append(ClosedPart(event, event))
+            self.parts.append(RecordedClosure(event, event))
         return not opens
 
 
@@ -81,12 +78,12 @@ class ClosedForATime:
 
 
 def closed_for_a_time(folder: Path) -> list[ClosedForATime]:
-    """Return the parts of lanes that were closed for a time, but for those that moved.
+    """Return the parts of lanes that were closed for a time, without vehicles of other systems.
 
     Raises:
         BadInputError: the events cannot be read.
     """
-    closed = ClosedParts()
+    closed = RecordedClosures()
     with reading(folder, EVENTS_FILE):
         for event in read_events(folder, PART_CLOSED, PART_OPENED):
             if event.get("cause") != PASSING:

@@ -12,6 +12,7 @@ from laneweave.protocol.summary import SUMMARY_FILE
 
 TRAJECTORIES_FILE: Final = "trajectories.parquet"
 TRIPS_FILE: Final = "trips.parquet"
+TICKS_FILE: Final = "ticks.parquet"
 EVENTS_FILE: Final = "events.jsonl"
 
 

@@ -1,35 +1,17 @@
-"""Events and formations of a recorded run."""
+"""Formations of a recorded run."""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
 
 import pyarrow.parquet as pq
 
 from laneweave.launch.formation_columns import FormationColumns, Formations
+from laneweave.launch.recordings.events import read_events
 from laneweave.launch.recordings.files import EVENTS_FILE, TRIPS_FILE, reading
 from laneweave.protocol.lattice import Lattice
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.wire.events import FORMATION_CLOSED
-
-
-def read_events(folder: Path, *kinds: str) -> Iterator[Mapping[str, Any]]:
-    """Yield the recorded events of the given kinds (none given: all), in the order of the file.
-
-    Raises:
-        BadInputError: the events cannot be read.
-    """
-    path = folder / EVENTS_FILE
-    if not path.is_file():
-        return
-    with reading(folder, EVENTS_FILE):
-        for line in path.read_text(encoding="utf-8").splitlines():
-            event = json.loads(line)
-            if not kinds or event["kind"] in kinds:
-                yield event
 
 
 def closed_formations(folder: Path, scenario: Scenario) -> Formations:

@@ -20,8 +20,9 @@ from laneweave.coordinator.planning.path_map import RelativePathMap
 from laneweave.launch.drawing.colours import lane_colours, text_colour, vehicle_colour
 from laneweave.launch.drawing.figures import INK, write
 from laneweave.launch.formation_columns import FormationColumns
+from laneweave.launch.recordings.events import read_events
 from laneweave.launch.recordings.files import EVENTS_FILE, reading
-from laneweave.launch.recordings.formations import read_events, recorded_formations
+from laneweave.launch.recordings.formations import recorded_formations
 from laneweave.launch.recordings.runs import Run
 from laneweave.launch.recordings.trajectories import NO_LATTICE, Floats, Tracks, read_trips
 from laneweave.launch.report.style import SMALL_TEXT, picture

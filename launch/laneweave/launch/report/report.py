@@ -30,8 +30,8 @@ PAPER_STRETCH_M = (500.0, 800.0)
 """Stretch of road in the paper's snapshots (Section 5.2.3) [m]."""
 
 COUNTED = (
-    f"Counted are vehicles that entered after the first {WARM_UP_S:g} s and before the last "
-    "arrival, and have left."
+    f"Counted are vehicles that entered after the first {WARM_UP_S:g} s and not after the last "
+    "arrival, and have left; on corridors, all that have left."
 )
 TOO_SHORT = f"No vehicle was counted, because the runs are too short. {COUNTED}"
 SPEED_CLOSED_CAPTION = (
@@ -83,7 +83,7 @@ def flow_caption(*, shares: bool, seeds: bool) -> str:
         "last counted one, as a share of the demand (dashed: 100 %). Over this short time "
         "arrivals can be denser than on average, and a jam can hold up the first vehicle, so that "
         "the throughput exceeds the demand.",
-        "Left in the preferred lane: share of the counted vehicles." if shares else "",
+        "Left in the preferred lane: share of the vehicles that left." if shares else "",
         "Methods are side by side at each volume.",
         "Small dots: runs; markers and bars: means and standard deviations over the seeds."
         if seeds

@@ -89,7 +89,7 @@ def _obstacle_row(one: ObstacleFigures) -> Row:
     """Return how long a part of a lane was closed, and what it cost."""
     what = f"{one.cause} of {one.vehicle}" if one.vehicle else one.cause
     until = "the end" if one.opened_s is None else f"{one.opened_s:.1f} s"
-    cost = "nobody stopped"
+    cost = "no vehicle stopped"
     if one.stopped:
         cost = f"{one.stopped} vehicles stopped, {one.waited_s / one.stopped:.0f} s each"
     place = f"lane {one.lane}, {one.from_m:.0f} to {one.to_m:.0f} m"

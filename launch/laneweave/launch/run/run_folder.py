@@ -13,7 +13,12 @@ from pathlib import Path
 
 from attrs import evolve
 
-from laneweave.launch.recordings.files import EVENTS_FILE, TRAJECTORIES_FILE, TRIPS_FILE
+from laneweave.launch.recordings.files import (
+    EVENTS_FILE,
+    TICKS_FILE,
+    TRAJECTORIES_FILE,
+    TRIPS_FILE,
+)
 from laneweave.protocol.errors import BadInputError, CommandFailedError, RefusedError
 from laneweave.protocol.files import write_atomically
 from laneweave.protocol.scenario.fields import Scenario
@@ -31,7 +36,7 @@ LOG_FILE = "log.jsonl"
 ROUTER_READY_FILE = "router.ready"
 """File in the temporary folder of a run that exists once the router listens."""
 EARLY_FILES = frozenset(
-    (LOG_FILE, EVENTS_FILE, SUMMARY_FILE, "ticks.parquet", TRAJECTORIES_FILE, TRIPS_FILE)
+    (LOG_FILE, EVENTS_FILE, SUMMARY_FILE, TICKS_FILE, TRAJECTORIES_FILE, TRIPS_FILE)
 )
 """Files that an interrupted run may have before a vehicle enters."""
 FOLDER_RULE = "a new or empty folder"

@@ -179,7 +179,7 @@ class Result:
     not_left: int
     """Number of vehicles that have not left the road."""
     failed: int = 0
-    """Number of runs that failed; those without a summary are in no figure but `runs`."""
+    """Number of runs that failed; those without a summary count only here and in `runs`."""
 
 
 def result_of(runs: Sequence[Run]) -> Result:

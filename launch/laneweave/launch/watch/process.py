@@ -120,9 +120,9 @@ def watch_recorded(folder: Path, listen: str, ready: Callable[[str], None]) -> N
     Raises:
         BadInputError: the folder does not hold a finished run, or the address cannot be used.
     """
-    from laneweave.launch.watch.recorded_run import Recording  # noqa: PLC0415 (needs pyarrow)
+    from laneweave.launch.watch.recorded_run import RecordedFrames  # noqa: PLC0415 (needs pyarrow)
 
-    recording = Recording(folder)
+    recording = RecordedFrames(folder)
 
     def health() -> tuple[bool, dict[str, Any]]:
         return True, {"recorded": str(folder)}

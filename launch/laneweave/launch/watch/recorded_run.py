@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 
 from laneweave.launch.drawing.colours import trip_lane
 from laneweave.launch.formation_columns import Formations
+from laneweave.launch.recordings.events import read_events
 from laneweave.launch.recordings.files import EVENTS_FILE, reading
-from laneweave.launch.recordings.formations import closed_formations, read_events
+from laneweave.launch.recordings.formations import closed_formations
 from laneweave.launch.recordings.runs import single_run
 from laneweave.launch.recordings.trajectories import NO_LATTICE, Tracks, read_tracks, read_trips
 from laneweave.launch.run_methods import FORMATION
@@ -70,7 +71,7 @@ class _Moment:
     """End of each part that is closed for a time, by lane and beginning."""
 
 
-class Recording:
+class RecordedFrames:
     """`FrameSource` of a finished run."""
 
     def __init__(self, folder: Path) -> None:

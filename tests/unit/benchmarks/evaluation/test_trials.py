@@ -16,7 +16,7 @@ OPTIONS = ("--transport", "simulated", "--volume", "900", "--duration", "5")
 def test_a_run_counts_if_its_status_is_the_expected_one(tmp_path: Path) -> None:
     """The second run is complete, but its breakdown did not happen, so its status is 1."""
     faults = tmp_path / "faults.toml"
-    faults.write_text('[[breakdown]]\nat_s = 500\n', encoding="utf-8")
+    faults.write_text("[[breakdown]]\nat_s = 500\n", encoding="utf-8")
     good = Trial("length", "good", OPTIONS)
     bad = Trial("length", "bad", (*OPTIONS, "--faults", str(faults)))
 

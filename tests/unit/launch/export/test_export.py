@@ -340,7 +340,7 @@ def test_on_a_full_disk_the_command_fails_in_one_line(
         ("trips.parquet", "cut", Format.fcd),
         ("trips.parquet", "cut", Format.csv),
         ("trajectories.parquet", "cut", Format.mcap),
-        ("events.jsonl", '{"t_s": 3.0, "ki', Format.mcap),
+        ("events.jsonl", '{"t_s": 3.0, "ki\n', Format.mcap),
         ("events.jsonl", "[]", Format.mcap),
     ],
 )

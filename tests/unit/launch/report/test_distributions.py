@@ -15,7 +15,7 @@ from attrs import evolve
 from numpy.typing import ArrayLike
 
 from laneweave.launch.drawing.figures import new_figure
-from laneweave.launch.recordings.formations import read_events
+from laneweave.launch.recordings.events import read_events
 from laneweave.launch.recordings.runs import Run, single_run
 from laneweave.launch.recordings.trajectories import Tracks, read_tracks
 from laneweave.launch.report.distributions import (

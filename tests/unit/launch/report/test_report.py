@@ -203,11 +203,11 @@ def test_one_line_says_what_is_wrong(
 @pytest.mark.parametrize(
     ("file", "damage", "of_sweep"),
     [
-        ("events.jsonl", lambda content: content[:-5], False),
-        ("events.jsonl", lambda content: content[:-5], True),
+        ("events.jsonl", lambda content: content.replace(b'"kind"', b'"ki', 1), False),
+        ("events.jsonl", lambda content: content.replace(b'"kind"', b'"ki', 1), True),
         ("events.jsonl", lambda content: content + b"[]", False),
         ("events.jsonl", lambda content: content + b'{"t_s": 1.0}', False),
-        ("events.jsonl", lambda content: content + b'{"kind": "formation-closed"}\xff', False),
+        ("events.jsonl", lambda content: content + b'{"kind": "formation-closed"}\xff\n', False),
         ("events.jsonl", lambda _: b'{"kind": "formation-closed", "role": "bridge"}\n', False),
         ("events.jsonl", lambda _: b'{"kind": "part-closed"}\n', False),
         ("trips.parquet", lambda content: content[:100], True),

@@ -15,7 +15,7 @@ from laneweave.launch.recordings.closed_parts import ClosedForATime, closed_for_
 from laneweave.launch.recordings.runs import single_run
 from laneweave.launch.recordings.trajectories import read_tracks
 from laneweave.launch.watch.frames import MOVING
-from laneweave.launch.watch.recorded_run import Recording
+from laneweave.launch.watch.recorded_run import RecordedFrames
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.scenario.road_tables import Closure
 from laneweave.protocol.vehicle.lane_ends import LaneEnds
@@ -26,13 +26,13 @@ from support.tables import for_each
 pytestmark = pytest.mark.slow
 
 
-def frames(recording: Recording) -> list[dict[str, Any]]:
+def frames(recording: RecordedFrames) -> list[dict[str, Any]]:
     return [json.loads(text) for text in recording.frames(0, recording.last)]
 
 
 @pytest.mark.more
 def test_vehicles_are_at_their_recorded_positions(recorded: Path) -> None:
-    recording, tracks = Recording(recorded), read_tracks(recorded)
+    recording, tracks = RecordedFrames(recorded), read_tracks(recorded)
     shown = frames(recording)
     assert [frame["n"] for frame in shown] == list(range(recording.last + 1))
     assert {frame["status"] for frame in shown} == {"recorded"}
@@ -54,7 +54,7 @@ def test_vehicles_are_at_their_recorded_positions(recorded: Path) -> None:
 
 
 def test_counts_lanes_and_leaders_are_those_of_the_run(recorded: Path) -> None:
-    recording, summary = Recording(recorded), single_run(recorded).summary
+    recording, summary = RecordedFrames(recorded), single_run(recorded).summary
     last = frames(recording)[-1]
     assert summary is not None
     vehicles = summary.vehicles
@@ -74,7 +74,7 @@ def test_formations_are_shown_from_their_closing_on(recorded: Path) -> None:
     ]  # fmt: skip
     assert len({rear - front for event in closed for rear, front in [event["columns"]]}) > 1
     seen: set[int] = set()
-    for frame in frames(Recording(recorded)):
+    for frame in frames(RecordedFrames(recorded)):
         there = {row[0] for row in frame["vehicles"]}
         known = [event for event in closed if event["t_s"] <= frame["t"]]
         assert sorted(frame["formations"], key=lambda one: one[0]) == [
@@ -92,7 +92,7 @@ def test_formations_are_shown_from_their_closing_on(recorded: Path) -> None:
 
 def test_an_older_recording_has_formations_of_equal_length(recorded: Path, tmp_path: Path) -> None:
     folder = older_recording(recorded, tmp_path / "run")
-    shown = frames(Recording(folder))
+    shown = frames(RecordedFrames(folder))
     assert {one[2] - one[1] for frame in shown for one in frame["formations"]} == {3}
     assert all(one[2] == -4 * one[0] for frame in shown for one in frame["formations"])
     # The time at which a block was closed is not known: it contains its vehicles from the start.
@@ -102,19 +102,19 @@ def test_an_older_recording_has_formations_of_equal_length(recorded: Path, tmp_p
 def test_formations_that_plan_together(recorded: Path, tmp_path: Path) -> None:
     folder = tmp_path / "run"
     shutil.copytree(recorded, folder)
-    first, second = Recording(folder).frame(100)["formations"][::-1][:2]
+    first, second = RecordedFrames(folder).frame(100)["formations"][::-1][:2]
     event = {"t_s": 15.0, "kind": "formations-joined", "role": "coordinator", "name": "c1"}
     blocks = list(range(-first[2], -second[1] + 1))
     with (folder / "events.jsonl").open("a") as events:
         events.write(json.dumps(event | {"formations": blocks}) + "\n")
         events.write(json.dumps(event | {"role": "agent", "formations": "all"}) + "\n")
-    recording = Recording(folder)
+    recording = RecordedFrames(folder)
     assert recording.frame(70)["joined"] == []
     assert recording.frame(100)["joined"] == [[first[0], second[0]]]
 
 
 def test_cells_beyond_a_stop_line_are_not_shown(recorded: Path) -> None:
-    recording, scenario = Recording(recorded), single_run(recorded).scenario
+    recording, scenario = RecordedFrames(recorded), single_run(recorded).scenario
     rolling = evolve(scenario.formation, operation="rolling")
     road = evolve(scenario.road, closures=(Closure(0, 300.0),))
     ends = LaneEnds(evolve(scenario, formation=rolling, road=road))
@@ -141,14 +141,14 @@ def test_parts_are_shown_while_they_are_closed(recorded: Path, tmp_path: Path) -
     with (folder / "events.jsonl").open("a") as events:
         events.write(closing(2.0, "part-closed") + closing(3.0, "part-closed", 440.0))
         events.write(closing(2.5, "part-closed", 300.0, "passing") + closing(6.0, "part-opened"))
-    recording = Recording(folder)
+    recording = RecordedFrames(folder)
     parts = [recording.frame(number)["parts"] for number in (5, 12, 20, 40)]
     assert parts == [[], [[1, 400.0, 450.0, 1]], [[1, 400.0, 440.0, 1]], []]
     assert closed_for_a_time(folder) == [ClosedForATime(1, 400.0, 450.0, 2.0, 6.0)]
 
 
 def test_there_are_no_frames_before_and_after(recorded: Path) -> None:
-    recording = Recording(recorded)
+    recording = RecordedFrames(recorded)
     assert recording.frames(recording.last + 1, recording.last + 9) == []
     assert len(recording.frames(recording.last - 1, recording.last + 9)) == 2
 
@@ -159,7 +159,7 @@ def test_an_incomplete_run_is_refused(recorded: Path, tmp_path: Path, lost: str)
     shutil.copytree(recorded, folder)
     (folder / lost).unlink()
     with pytest.raises(BadInputError, match=r"the folder of a|a run that kept this file"):
-        Recording(folder)
+        RecordedFrames(folder)
 
 
 def test_a_run_with_damaged_events_is_refused(recorded: Path, tmp_path: Path) -> None:
@@ -167,7 +167,7 @@ def test_a_run_with_damaged_events_is_refused(recorded: Path, tmp_path: Path) ->
     shutil.copytree(recorded, folder)
     (folder / "events.jsonl").write_text('{"t_s": 1.0}\n')
     with pytest.raises(BadInputError, match=r"events\.jsonl"):
-        Recording(folder)
+        RecordedFrames(folder)
 
 
 @for_each(

@@ -26,7 +26,7 @@ from laneweave.launch.observe.findings import RULES, Finding, FindingsMetrics
 from laneweave.launch.observe.metrics_server import text_of
 from laneweave.launch.watch.frames import MAX_REQUESTED, FrameBuffer, FrameSource, compact, ending
 from laneweave.launch.watch.listening import open_socket
-from laneweave.launch.watch.recorded_run import Recording
+from laneweave.launch.watch.recorded_run import RecordedFrames
 from laneweave.launch.watch.server import Browser, Browsers, make_app, request_of
 from laneweave.protocol.errors import BadInputError
 from support.tables import for_each
@@ -277,7 +277,7 @@ def test_the_end_does_not_wait_for_browsers() -> None:
 
 @pytest.mark.slow
 def test_a_recorded_run_over_the_websocket(recorded: Path) -> None:
-    recording = Recording(recorded)
+    recording = RecordedFrames(recorded)
     with Site(recording).running() as site, site.browser() as browser:
         scene = receive(browser)["scene"]
         assert (scene["kind"], scene["first"], scene["last"]) == ("recorded", 0, recording.last)
