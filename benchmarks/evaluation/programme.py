@@ -47,6 +47,8 @@ PARTS: Final = (
     Part(("rolling",), VOLUMES, KeepTrajectories.all),
     Part(("formations",), _up_to(2000.0), KeepTrajectories.all),
     Part(("paper-6", "paper-12"), _up_to(1800.0), KeepTrajectories.all),
+    # More than the paper's bound, to see that no more is carried.
+    Part(("paper-12",), (2000.0,), KeepTrajectories.all),
     # Jams only grow with the volume, and take longer to simulate than everything else.
     Part(("rule", "rule-yielding"), _up_to(1800.0), KeepTrajectories.first_seed),
     Part(("rule-net",), _up_to(1600.0), KeepTrajectories.first_seed),

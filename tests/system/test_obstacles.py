@@ -20,6 +20,7 @@ from laneweave.protocol.wire.events import (
 )
 from support.deployments import deployment, free_tcp, start_router, stop
 from support.harness import Ended, Lab, check_safe_and_complete, events, summary
+from support.variants import variants
 
 ROAD = {
     "road": {"s1_m": 50.0, "s2_m": 100.0, "s3_m": 750.0},
@@ -93,9 +94,8 @@ def mean_s(found: RunSummary) -> float:
     return found.travel_time_s.mean
 
 
-@pytest.mark.parametrize(
-    ("from_m", "speed_mps"), [(500.0, 6.0), pytest.param(500.0, 10.0, marks=pytest.mark.more)]
-)
+@pytest.mark.more
+@pytest.mark.parametrize(("from_m", "speed_mps"), [(500.0, 6.0), (500.0, 10.0)])
 def test_the_others_pass_a_slow_vehicle(tmp_path: Path, from_m: float, speed_mps: float) -> None:
     event = {"lane": 1, "from_m": from_m, "to_m": from_m + 7.0, "at_s": 30.0, "for_s": 30.0}
     found = run(tmp_path / "run", road__events=(event | {"speed_mps": speed_mps},))
@@ -111,8 +111,9 @@ def test_the_others_pass_a_slow_vehicle(tmp_path: Path, from_m: float, speed_mps
 
 @pytest.mark.parametrize(
     ("operation", "loss"),
-    [("rolling", 0.0), ("formations", 0.0)]
-    + [pytest.param(one, 0.3, marks=pytest.mark.more) for one in ("rolling", "formations")],
+    variants(
+        [("formations", 0.0), ("rolling", 0.0), ("formations", 0.3), ("rolling", 0.3)], count=1
+    ),
 )
 def test_the_lane_is_cleared_before_a_fast_vehicle(
     tmp_path: Path, operation: str, loss: float

@@ -38,6 +38,7 @@ def pytest_of(folder: Path, text: str) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.slow
+@pytest.mark.more
 def test_the_example_of_the_guide_passes(tmp_path: Path) -> None:
     guide = (ROOT / "docs" / "FAULTS.md").read_text(encoding="utf-8")
     (example,) = re.findall(r"```python\n(import pytest\n.*?)```", guide, re.DOTALL)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -80,12 +80,6 @@ class Run:
         return self.summary.preferred_percent
 
     @property
-    def settings(self) -> dict[str, Any]:
-        """Values of the scenario that can change the results, by path (`table.field`)."""
-        values = flatten(to_tables(self.scenario), ".")
-        return {name: one for name, one in values.items() if affects(name, self.method)}
-
-    @property
     def order(self) -> tuple[tuple[int, str], float, int]:
         """Sort key: label, volume, seed."""
         return rank(self.label), self.volume_veh_per_lane_h, self.scenario.seed
@@ -149,12 +143,29 @@ class Comparison:
         return next((run for run in found if run is not None), None)
 
 
+def settings_of(scenario: Scenario, method: str, ignored: Collection[str] = ()) -> dict[str, Any]:
+    """Return the values of a scenario that can change the results of a method.
+
+    Args:
+        scenario: the scenario.
+        method: value of `laneweave run --method`.
+        ignored: paths that are left out.
+
+    Returns:
+        Values by path (`table.field`).
+    """
+    values = flatten(to_tables(scenario), ".")
+    return {
+        name: one for name, one in values.items() if name not in ignored and affects(name, method)
+    }
+
+
 def _labels_of_like_runs(runs: Iterable[Run]) -> set[str]:
     """Return the labels whose runs differ in volume or seed, and in nothing else."""
     counts = Counter(run.order for run in runs)
     kinds: dict[str, set[str]] = {}
     for run in runs:
-        own = run.settings | dict.fromkeys(VARIED)
+        own = settings_of(run.scenario, run.method, VARIED)
         faults = None if run.summary is None else run.summary.faults
         if faults is not None:
             own["faults"] = sorted({one["fault"] for one in faults["injected"]})

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 
-from laneweave.launch.recordings.runs import Run
+from laneweave.launch.recordings.runs import VARIED, Run, settings_of
 from laneweave.launch.run_methods import METHODS, REFERENCE_METHODS
 from laneweave.launch.sweep.execution import run_locally
 from laneweave.launch.sweep.folder import SweepFolder
@@ -44,7 +44,8 @@ def finished_runs(
         out: folder of the runs, which is locked in the context.
         workers: maximum number of simultaneous processes.
         show: whether to show progress.
-        prefix: labels that begin with it may be in the folder without being in `points`.
+        prefix: labels that begin with it may be in the folder without being in `points`; runs of
+            the labels in `points` may have other volumes and seeds.
 
     Raises:
         BadInputError: the folder has other runs, or runs with other settings.
@@ -56,7 +57,8 @@ def finished_runs(
         for name, run in folder.runs.items():
             point = wanted.get(name)
             if point is None:
-                known = run.label in found or (prefix and run.label.startswith(prefix))
+                known = any(_are_alike(run, one) for one in points if one.label == run.label)
+                known |= run.label not in found and bool(prefix and run.label.startswith(prefix))
             else:
                 known = (run.method, run.scenario, run.plug_in) == (
                     point.method,
@@ -70,3 +72,10 @@ def finished_runs(
         for point in points:
             found[point.label].append(folder.runs[point.name])
         yield found
+
+
+def _are_alike(run: Run, point: Point) -> bool:
+    """Return whether a run and a point differ only in volume and seed."""
+    return run.method == point.method and settings_of(
+        run.scenario, run.method, VARIED
+    ) == settings_of(point.scenario, point.method, VARIED)

@@ -25,7 +25,7 @@ from attrs import evolve
 
 from laneweave.launch.recordings.files import TRIPS_FILE
 from laneweave.launch.recordings.results_over_seeds import write_results
-from laneweave.launch.recordings.runs import SWEEP_FILE, Run, sweep_runs, write_point
+from laneweave.launch.recordings.runs import SWEEP_FILE, Run, settings_of, sweep_runs, write_point
 from laneweave.launch.run_methods import REFERENCE_METHODS, labelled
 from laneweave.launch.sweep.execution import LOG_FILE, PointResult, kept_files
 from laneweave.launch.sweep.points import Point, with_volume
@@ -102,8 +102,8 @@ class SweepFolder:
                 allowed = f"{run.plug_in}, which made {self.out / name}; or a new folder"
                 raise BadInputError(f"version of {run.label}", installed, allowed)
             wanted = evolve(with_volume(base, run.volume_veh_per_lane_h), seed=run.scenario.seed)
-            expected = evolve(run, scenario=method.settings(wanted)).settings
-            recorded = run.settings
+            expected = settings_of(method.settings(wanted), run.method)
+            recorded = settings_of(run.scenario, run.method)
             where = f"as recorded in {self.out / name}; other settings require a new folder"
             for field in dict.fromkeys([*recorded, *expected]):
                 value, own = recorded.get(field), expected.get(field)

@@ -289,7 +289,21 @@ def test_statements_follow_the_data() -> None:
     assert cells(table, "Formation control is faster")[2] == "holds"
     bound = cells(table, "At most 3600 v_F / 2 d_F")
     assert bound[0].endswith("here 1800 veh/(lane h)")
-    assert bound[2] == "holds"
+    # Of 2000, all are carried.
+    assert "carries 1750 of 1750 and 2000 of 2000" in bound[1]
+    assert bound[2] == "**does not hold**"
+    rows = [
+        row
+        for row in full().points
+        if (row.label, row.volume_veh_per_lane_h) != ("paper-12", 2000.0)
+    ]
+    for most, verdict in ((1799.0, "holds"), (None, "so far: holds")):
+        more = [] if most is None else [
+            evolve(one, throughput_veh_per_lane_h=most)
+            for one in point("paper-12", 2000.0, 90.0).runs
+        ]  # fmt: skip
+        known = evidence(*rows, *([points_of_runs(more)[0]] if more else []))
+        assert cells(statements_table(known), "At most 3600 v_F / 2 d_F")[2] == verdict
     assert "`formations` carries 2000 of 2000, `rolling` carries 2400 of 2400" in bound[1]
     # At 500 and 750 the rules take 57.5 and 63.75 s, formations 67.4 s.
     assert cells(table, "Below 1000")[2] == "**does not hold**"

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 import laneweave
+from support.variants import variants
 
 
 def drive(
@@ -32,7 +33,7 @@ def drive(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("operation", ["formations", "rolling"])
+@pytest.mark.parametrize("operation", variants(["formations", "rolling"]))
 def test_every_ballot_is_as_at_the_full_rate(tmp_path: Path, operation: str) -> None:
     """Plans are made and come into force in the same ticks, since ballots end the rest."""
     full, expected = drive(tmp_path / "full", operation, 1)

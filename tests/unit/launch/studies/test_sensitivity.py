@@ -172,6 +172,8 @@ def test_the_command_writes_a_page_and_continues(laneweave: Here, tmp_path: Path
     assert found["base"]["runs"] == 1
     _, _, errors = laneweave(*command)
     assert "runs were already finished" in errors[0]
+    others = *command, "--seeds", "2:3", "--duration", "80"
+    assert laneweave.refused(*others).startswith("--out")
 
 
 def test_bad_input(laneweave: Here) -> None:

@@ -221,6 +221,8 @@ def test_the_command_finds_prints_and_continues(laneweave: Here, tmp_path: Path)
         status, _, errors = laneweave(*command)
     assert (status, Path(errors[-1]).parent) == (1, tmp_path / "found")
     assert errors[-1].endswith(f": {full}")
+    others = *command, "--seeds", "8:9", "--duration", "80"
+    assert laneweave.refused(*others).startswith("--out")
     other = "sensitivity", "--method", "rule", "--out", tmp_path / "found"
     assert laneweave.refused(*other).startswith("--out")
     assert laneweave.refused("tune", "lc2014").startswith("METHOD: got 'lc2014'")

@@ -182,7 +182,15 @@ def check_that_nobody_waits_for_a_repair(volume: float = 1500.0, seed: int = 2) 
     assert {*out[-2:]}.isdisjoint(beyond)
 
 
-@pytest.mark.parametrize("later", [(), (RoadEvent(LANE, 600.0, 650.0, 0.0),)], ids=["no", "yes"])
+@pytest.mark.parametrize(
+    "later",
+    variants(
+        [
+            pytest.param((RoadEvent(LANE, 600.0, 650.0, 0.0),), id="yes"),
+            pytest.param((), id="no"),
+        ]
+    ),
+)
 def test_who_starts_behind_a_body_keeps_its_distance_although_the_lane_ends_later(
     later: tuple[RoadEvent, ...],
 ) -> None:
@@ -334,7 +342,7 @@ def test_others_stop_at_the_line_or_behind_it_and_never_touch_the_vehicle() -> N
     assert sum(front_m > line_m + 1.0 for front_m in others) * 6.0 <= part.late_m
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", variants([1, 2, 3]))
 def test_those_that_wait_start_one_after_the_other_wherever_they_stand(seed: int) -> None:
     """Each gap passes a vehicle once the one ahead has started, or it would have to wait anew."""
     road = lonely_road(BREAKS_DOWN, volume=1450.0, seed=seed)
