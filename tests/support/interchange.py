@@ -186,7 +186,7 @@ def vehicle(name: str, depart_s: float, route: str, kind: str = "car") -> str:
     """Return the XML element of a vehicle; `route` is one of `ROUTES`."""
     edges = ROUTES[route]
     return (
-        f'<vehicle id="{name}" type="{kind}" depart="{depart_s:g}" departSpeed="max">'
+        f'<vehicle id="{name}" type="{kind}" depart="{depart_s:.10g}" departSpeed="max">'
         f'<route edges="{edges}"/></vehicle>'
     )
 

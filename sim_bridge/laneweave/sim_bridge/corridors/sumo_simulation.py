@@ -198,7 +198,7 @@ def _draw(config: SumoConfig, folder: Path, window: TimeWindow, seed: int) -> Su
         "vehroute-output.last-route": "true",
     }
     for name, value in (("begin", window.begin_s), ("scale", window.scale)):
-        options |= {} if value is None else {name: f"{value:g}"}
+        options |= {} if value is None else {name: f"{value:.10g}"}
     with SumoProcess(config.command(seed, options)) as sumo:
         network = read_network(sumo)
         begin_s, until_s = sumo.simulation.getTime(), sumo.simulation.getEndTime()
@@ -206,7 +206,7 @@ def _draw(config: SumoConfig, folder: Path, window: TimeWindow, seed: int) -> Su
         end_s = min(begin_s + window.duration_s, window.end_s, until_s)
         # One step more: a vehicle departs in the first step after its time.
         step_s = sumo.simulation.getDeltaT()
-        waiting = _drive(sumo, end_s + step_s, min(LATEST_S, until_s))
+        waiting, factors = _drive(sumo, end_s + step_s, min(LATEST_S, until_s))
         sumo.simulation.saveState(str(state))
         types = {name: _type(sumo, name) for name in sumo.vehicletype.getIDList()}
         found = [*_not_departed(sumo, waiting, types)]
@@ -215,7 +215,7 @@ def _draw(config: SumoConfig, folder: Path, window: TimeWindow, seed: int) -> Su
     for _, element in ET.iterparse(routes):  # noqa: S314 (SUMO has written it, and closed it)
         persons += element.tag in {"person", "container"}
         if element.tag == "vehicle":
-            found.append(_departed(element, types, begin_s, ahead))
+            found.append(_departed(element, types, begin_s, ahead, factors))
             element.clear()
     inside = sorted(
         (one for one in found if one.depart_s < end_s or math.isinf(one.depart_s)),
@@ -224,10 +224,10 @@ def _draw(config: SumoConfig, folder: Path, window: TimeWindow, seed: int) -> Su
     departures_s = [one.depart_s for one in inside if math.isfinite(one.depart_s)]
     if not departures_s:
         first_s = min((one.depart_s for one in found), default=math.inf)
-        hint = f"the first one departs at {first_s:g} s: --begin {first_s:g}"
+        hint = f"the first one departs at {first_s:.10g} s: --begin {first_s:.10g}"
         raise BadInputError(
             f"demand of {config.file}",
-            Described(f"{begin_s:g} s to {end_s:g} s"),
+            Described(f"{begin_s:.10g} s to {end_s:.10g} s"),
             "a time in which vehicles depart" + (f"; {hint}" if math.isfinite(first_s) else ""),
         )
     end_s = min(end_s, math.floor(departures_s[-1]) + 1.0)
@@ -235,23 +235,26 @@ def _draw(config: SumoConfig, folder: Path, window: TimeWindow, seed: int) -> Su
     return SumoSimulation(config, network, tuple(inside), begin_s, end_s, step_s, elements, persons)
 
 
-def _drive(sumo: SumoProcess, end_s: float, latest_s: float) -> Mapping[str, float]:
+def _drive(
+    sumo: SumoProcess, end_s: float, latest_s: float
+) -> tuple[Mapping[str, float], Mapping[str, float]]:
     """Drive until a time, or until the first vehicle departs if it does so later.
 
     Returns:
         Vehicles that have been loaded and have not departed, with the times at which they were to
-        depart.
+        depart; and the speed factors of those that have departed, which SUMO's output lacks.
     """
-    waiting, departed = _due_s(sumo), False
+    waiting = _due_s(sumo)
+    factors: dict[str, float] = {}
     while sumo.simulation.getMinExpectedNumber() > 0:
-        if sumo.simulation.getTime() >= (end_s if departed or waiting else latest_s):
+        if sumo.simulation.getTime() >= (end_s if factors or waiting else latest_s):
             break
         sumo.step()
         waiting |= _due_s(sumo)
         for name in sumo.simulation.getDepartedIDList():
             waiting.pop(name, None)
-            departed = True
-    return waiting
+            factors[name] = sumo.vehicle.getSpeedFactor(name)
+    return waiting, factors
 
 
 def _due_s(sumo: SumoProcess) -> dict[str, float]:
@@ -293,7 +296,8 @@ def _not_departed(
             _route(sumo, name),
             types[type_name],
             type_name,
-            stops=_stops(sumo, name),
+            _with_factor({}, sumo.vehicle.getSpeedFactor(name)),
+            _stops(sumo, name),
         )
 
 
@@ -331,6 +335,7 @@ def _departed(
     types: Mapping[str, SumoType],
     begin_s: float,
     ahead: Mapping[str, tuple[Attributes, ...]],
+    factors: Mapping[str, float],
 ) -> SumoVehicle:
     """Return a vehicle of SUMO's output.
 
@@ -339,6 +344,7 @@ def _departed(
         types: the types, by name.
         begin_s: when the simulation has begun.
         ahead: stops that vehicles have not reached.
+        factors: speed factors, which depend on the vehicle, by its name.
     """
     attributes = {name: value for name, value in element.attrib.items() if name not in _NOT_KEPT}
     if float(attributes.get("departSpeed", "0")) > 0.0:
@@ -352,9 +358,13 @@ def _departed(
         tuple(route.get("edges", "").split()),
         types[type_name],
         type_name,
-        attributes,
+        _with_factor(attributes, factors.get(name)),
         (*map(_stop, element.iter("stop")), *ahead.get(name, ())),
     )
+
+
+def _with_factor(attributes: Attributes, factor: float | None) -> Attributes:
+    return attributes if factor is None else {**attributes, "speedFactor": f"{factor:.6g}"}
 
 
 def _departure_s(text: str, begin_s: float) -> float:

@@ -91,6 +91,32 @@ def test_flows_are_vehicles_as_sumo_makes_them(tmp_path: Path) -> None:
     assert departures == {f"f.{number}": 10.0 + 20.0 * number for number in range(4)}
 
 
+def test_drivers_keep_the_speed_factors_that_sumo_has_drawn(tmp_path: Path) -> None:
+    """Those of a type without deviation, and drawn ones, which differ."""
+    slow = '<vType id="slow" speedFactor="0.8" speedDev="0"/>'
+    vehicles = [vehicle("a", 0.0, "main", "slow"), vehicle("b", 1.0, "main", "slow")]
+    vehicles += [vehicle(f"c{number}", 2.0 + number, "main") for number in range(4)]
+    config = write_interchange(tmp_path, vehicles, types=slow)
+    found = read_corridor(config, CORRIDOR)
+    factors = {one.vehicle.name: one.vehicle.speed_factor for one in found.passes}
+    assert (factors["a"], factors["b"]) == (0.8, 0.8)
+    assert len({factors[f"c{number}"] for number in range(4)}) == 4
+    setup_of(found, parse_scenario(scenario_tables(found))).drive_alone(tmp_path, tmp_path)
+    root = ET.parse(tmp_path / "vehicles.rou.xml").getroot()  # noqa: S314 (its own file)
+    alone = {one.attrib["id"]: float(one.attrib["speedFactor"]) for one in root.iter("vehicle")}
+    assert alone == factors
+
+
+def test_a_begin_with_many_digits_is_not_rounded(tmp_path: Path) -> None:
+    begin_s = 1_234_565.0
+    vehicles = [vehicle(f"v{number}", begin_s - 5.0 + number, "main") for number in range(10)]
+    config = write_interchange(tmp_path, vehicles)
+    config.write_text(config.read_text(encoding="utf-8").replace('value="300"', 'value="2e6"'))
+    found = read_corridor(config, CORRIDOR, TimeWindow(begin_s=begin_s, duration_s=20.0))
+    assert found.simulation.begin_s == begin_s
+    assert min(one.vehicle.depart_s for one in found.passes) >= begin_s
+
+
 def test_arrivals_have_names_of_laneweave_and_lanes_that_suit_them(
     interchange: SumoCorridor, scenario: Scenario
 ) -> None:
