@@ -13,8 +13,9 @@ from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.sim_bridge.recording.driving_measures import DrivingMeasures
 from laneweave.sim_bridge.recording.trajectories import Sample, Trajectories
-from laneweave.sim_bridge.recording.trips import Trip, metadata_of, trips_table
+from laneweave.sim_bridge.recording.trips import Trip, metadata_of
 from laneweave.sim_bridge.road.demand import Arrival
+from support.recorded_trips import trips_table
 
 
 def make_run(

@@ -50,14 +50,14 @@ def parallel_env(
     Raises:
         BadInputError: the scenario or a value is invalid; the scenario has a SUMO simulation.
     """
-    if not 1 <= columns <= MAX_COLUMNS:
-        raise BadInputError("columns", columns, f"1 to {MAX_COLUMNS}")
+    if type(columns) is not int or not 1 <= columns <= MAX_COLUMNS:
+        raise BadInputError("columns", columns, f"an integer from 1 to {MAX_COLUMNS}")
     if agents not in get_args(Agents):
         raise unknown_name("agents", agents, get_args(Agents))
     if slots is not None and agents != "slots":
         raise BadInputError("slots", slots, 'None, unless agents="slots"')
-    if slots is not None and not (isinstance(slots, int) and 1 <= slots <= MAX_SLOTS):
-        raise BadInputError("slots", slots, f"1 to {MAX_SLOTS}, or None")
+    if slots is not None and not (type(slots) is int and 1 <= slots <= MAX_SLOTS):
+        raise BadInputError("slots", slots, f"an integer from 1 to {MAX_SLOTS}, or None")
     modes = VehiclesEnv.metadata["render_modes"]
     if render_mode is not None and render_mode not in modes:
         raise unknown_name("render_mode", render_mode, modes)

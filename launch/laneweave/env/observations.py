@@ -170,7 +170,7 @@ class Observer:
             for section in scenario.geometry.sections
             if section.lane == lane and section.from_m <= s_m <= section.to_m
         ]
-        along_m = 0.0 if column is None else s_m - lattice.cell_s_m(column, t_s)
+        along_m = s_m - lattice.cell_s_m(column, t_s)
         return (
             s_m / length_m,
             max(0.0, scenario.geometry.moves_from_m - s_m) / length_m,

@@ -92,8 +92,9 @@ class EpisodeRecord:
     def on_refused(self, t_s: float, vehicle: Name, refusal: Refusal) -> None:
         """Do nothing."""
 
-    def on_lane_end(self, t_s: float, vehicle: Name, lane: int, kind: str) -> None:
+    def on_lane_end(self, t_s: float, vehicle: Name, lane: int, kind: str, s_m: float) -> None:
         """Count that a vehicle has left the lattice at a dead end, or comes back."""
+        del s_m
         self.event(t_s, kind, vehicle=vehicle, lane=lane)
 
     def on_obstacle(self, t_s: float, kind: str, obstacle: Obstacle) -> None:

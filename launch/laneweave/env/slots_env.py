@@ -55,7 +55,7 @@ class SlotsEnv(VehiclesEnv):
             Observations and infos of all slots.
 
         Raises:
-            BadInputError: the seed is negative.
+            BadInputError: the seed is negative, or no integer.
         """
         del options
         observations, infos = self._begin(seed)

@@ -152,7 +152,7 @@ class VehiclesEnv(ParallelEnv[str, Observation, int]):
             options: ignored.
 
         Raises:
-            BadInputError: the seed is negative.
+            BadInputError: the seed is negative, or no integer.
         """
         del options
         observations, infos = self._begin(seed)
@@ -226,8 +226,8 @@ class VehiclesEnv(ParallelEnv[str, Observation, int]):
     def _begin(self, seed: int | None) -> tuple[dict[str, Observation], Infos]:
         """Begin an episode; return observations and infos of the vehicles on the road."""
         if seed is not None:
-            if seed < 0:
-                raise BadInputError("seed", seed, "at least 0")
+            if not isinstance(seed, int | np.integer) or seed < 0:
+                raise BadInputError("seed", seed, "an integer of at least 0")
             self._seeds = SeedSequence(seed)
         drawn = int(self._seeds.spawn(1)[0].generate_state(1)[0]) % SEEDS
         scenario = evolve(self.scenario, seed=drawn)

@@ -205,7 +205,8 @@ class SimulatedRoad(Generic[VehicleT]):
             self._record.on_obstacle(self.t_s, kind, obstacle)
         for change in changes:
             self.caretakers.begin_anew(self.vehicles[change.vehicle], self.tick)
-            self._record.on_lane_end(self.t_s, change.vehicle, change.lane, change.kind)
+            s_m = self.vehicles[change.vehicle].state[0]
+            self._record.on_lane_end(self.t_s, change.vehicle, change.lane, change.kind, s_m)
         self._close_formations()
         self._roadside.assign_empty_cells(self.vehicles)
         yield from self._roadside.publish(self.tick, self.t_s, self.vehicles.values())

@@ -314,6 +314,12 @@ def test_files_scenarios_and_tables_give_the_same_environment() -> None:
 def test_bad_input() -> None:
     with pytest.raises(BadInputError, match="columns"):
         parallel_env(SHORT, columns=0)
+    for wrong in (2.5, "3", True):
+        with pytest.raises(BadInputError, match="columns"):
+            parallel_env(SHORT, columns=wrong)  # type: ignore[arg-type]
+    for seed in (1.5, "a", -1):
+        with pytest.raises(BadInputError, match="seed"):
+            parallel_env(SHORT).reset(seed=seed)  # type: ignore[arg-type]
     with pytest.raises(BadInputError, match="sumo"):
         parallel_env({"sumo": {"config": "x.sumocfg", "corridor": "a:b"}})
     with pytest.raises(BadInputError, match=r"radio\.technology: got 'c-v2x'"):

@@ -193,7 +193,7 @@ def stages(
         scenario: road, structures.
         closed: parts that are closed for a time (`with_queues`).
         overtaken: where others overtake the formation (`where_overtaken`). It may change lanes up
-            to their beginning: nobody stops there.
+            to their beginning: no vehicle stops there.
     """
     start_m, road_m = scenario.road.sorting_start_m, scenario.road.length_m
     avoided = (*closed, *(one.closure for one in overtaken))
@@ -202,7 +202,7 @@ def stages(
     structures = [one for one in scenario.formation.structures if one.from_m >= passed_m]
     formed_m = pairwise([*(one.from_m for one in structures), start_m])
     sections = cut(scenario.geometry.sections, avoided)
-    # Where others overtake, nobody stops, but for a closed part in the same place.
+    # Where others overtake, no vehicle stops, but for a closed part in the same place.
     last_m = {(one.lane, one.from_m): _last_m(one, closed, scenario) for one in overtaken}
     lines_m = [
         last_m.get((one.lane, one.to_m), to_line.to_m)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
+from statistics import fmean
 from typing import Any, Final
 
 import attrs
@@ -80,7 +81,7 @@ def bench_planner(
     """Measure the planner.
 
     Args:
-        vehicles: formation sizes.
+        vehicles: formation sizes; in the family `traffic` the largest ones.
         families: names from `FAMILIES`.
         instances: number of instances per size and family.
         seed: seed of the first instance; it increases by 1 per instance.
@@ -89,22 +90,28 @@ def bench_planner(
 
     Yields:
         One row per family and size.
+
+    Raises:
+        BadInputError: a size does not fit into a family; nothing has been measured.
     """
+    drawn = {
+        (family, size): [
+            FAMILIES[family].request(seed + index, size, deadline_s) for index in range(instances)
+        ]
+        for family in families
+        for size in vehicles
+    }
     BRANCHING.load()
-    for family in families:
-        for size in vehicles:
-            requests = [
-                FAMILIES[family].request(seed + index, size, deadline_s)
-                for index in range(instances)
-            ]
-            yield {
-                "family": family,
-                "vehicles": size,
-                "instances": instances,
-                "solver": solver,
-                "deadline_s": deadline_s,
-                **_measured(requests, solver),
-            }
+    for (family, size), requests in drawn.items():
+        yield {
+            "family": family,
+            "vehicles": size,
+            "mean_vehicles": round(fmean(len(one.vehicles) for one in requests), 1),
+            "instances": instances,
+            "solver": solver,
+            "deadline_s": deadline_s,
+            **_measured(requests, solver),
+        }
 
 
 def _measured(requests: Sequence[PlanRequest], solver: str) -> dict[str, Any]:
@@ -160,7 +167,7 @@ def planner_table(rows: Sequence[dict[str, Any]]) -> Table:
         cpu, gap = row["cpu_ms"], row["gap_percent"]
         table.add_row(
             row["family"],
-            str(row["vehicles"]),
+            f"{row['mean_vehicles']:g}",
             f"{row['optimal']} of {row['instances']}",
             *(f"{cpu[name]:.1f}" for name in ("p50", "p95", "max")),
             *("-" if gap[name] is None else f"{gap[name]:.1f}" for name in ("p50", "max")),

@@ -30,6 +30,7 @@ _TRAFFIC_VOLUMES = (1000, 2000)
 """veh/(lane h)"""
 _MIN_HEADWAY_S = 1.0
 _TRAFFIC_LANES, _TRAFFIC_COLUMNS = 3, (3, 7)
+"""Number of lanes; (lowest, highest) number of columns of a formation."""
 
 
 def block_request(

@@ -24,6 +24,7 @@ from laneweave.launch.recordings.files import TICKS_FILE
 from laneweave.launch.run.local_run import LocalRun
 from laneweave.protocol.config.participants import coordinator_names
 from laneweave.protocol.config.scenario_files import load_scenario
+from laneweave.protocol.errors import CommandFailedError
 from laneweave.protocol.runtime.temporary_folders import temporary_folder
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.sim_bridge.recording.statistics import percentiles_of
@@ -101,6 +102,7 @@ def bench_runtime(
 
     Raises:
         BadInputError: the fault file or preset does not exist, or is invalid.
+        CommandFailedError: the run has failed, or ended within the measured time.
     """
     base = load_scenario(None)
     volume = vehicles / (base.geometry.free_flow_s * base.road.lanes) * 3600.0
@@ -122,6 +124,9 @@ def bench_runtime(
             watch=window.watch,
         )
         outcome = run.run().or_interrupt()
+        if window.ended is None or outcome.problems:
+            why = "; ".join(outcome.problems) or "it ended before the end of the measurement"
+            raise CommandFailedError(f"the run with {vehicles} vehicles has failed: {why}")
         ticks = pq.read_table(folder / "run" / TICKS_FILE)
     times_s = ticks.column("t_s").to_numpy()
     measured = (times_s > window.begin_s) & (times_s <= window.end_s)
@@ -135,7 +140,6 @@ def bench_runtime(
         "tick_ms": percentiles_of(ticks.column("tick_ms").to_numpy()[measured], 50, 99),
         "cpu_ms_per_tick": _per_tick(window, scenario),
         "memory_mib": _memory(window),
-        "problems": list(outcome.problems),
     }
 
 

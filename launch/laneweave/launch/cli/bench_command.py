@@ -5,14 +5,14 @@ from __future__ import annotations
 import json
 import re
 from enum import StrEnum
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
 
 from laneweave.launch.cli.options import SOLVER_NAMES
 from laneweave.protocol.config.scenario_files import load_scenario
-from laneweave.protocol.errors import BadInputError, unknown_name
+from laneweave.protocol.errors import BadInputError, CommandFailedError, unknown_name
 
 
 class Benchmark(StrEnum):
@@ -81,22 +81,32 @@ def bench(
         found = bench_planner(
             sizes, chosen, instances=instances, seed=seed, deadline_s=deadline, solver=solver
         )
-        rows, make_table = list(found), planner_table
+        make_table = planner_table
     elif what is Benchmark.tracker:
-        rows = bench_tracker(load_scenario(None), instances=instances, seed=seed)
+        found = iter(bench_tracker(load_scenario(None), instances=instances, seed=seed))
         make_table = tracker_table
     else:
         sizes = _parse_sizes(vehicles, "30,60,90")
-        rows = [
+        found = (
             bench_runtime(size, seconds=seconds, per_process=per_process, seed=seed, faults=faults)
             for size in sizes
-        ]
+        )
         make_table = runtime_table
+    rows: list[dict[str, Any]] = []
+    failure: CommandFailedError | None = None
+    try:
+        rows.extend(found)
+    except CommandFailedError as error:
+        if not rows:
+            raise
+        failure = error  # what has been measured is printed
     if as_json:
         result = {"benchmark": what.value, "machine": machine(), "results": rows}
         typer.echo(json.dumps(result, indent=2))
     else:
         Console().print(make_table(rows))
+    if failure is not None:
+        raise failure
 
 
 def _parse_sizes(text: str | None, default: str) -> list[int]:

@@ -13,6 +13,7 @@ from laneweave.launch.cli.options import (
     Seeds,
     check_jobs,
     parse_seeds,
+    reject_unused_options,
     shows_progress,
 )
 from laneweave.protocol.errors import BadInputError
@@ -46,7 +47,7 @@ def simulate(
         typer.Option(
             "--shrink",
             metavar="FILE",
-            help="Shrink the run of the first failed seed, and write its story.",
+            help="Shrink the run of the first failed seed, or the story, and write its story.",
         ),
     ] = None,
     story: Annotated[
@@ -59,10 +60,11 @@ def simulate(
     from laneweave.launch.fault_search import profiles, search
     from laneweave.launch.fault_search.story import Story
 
-    if story is not None:
-        _run_story(Story.read(story), verbose=verbose)
     if shrink is not None and (shrink.is_dir() or not shrink.parent.is_dir()):
         raise BadInputError("--shrink", str(shrink), "a file in an existing folder")
+    if story is not None:
+        reject_unused_options("with --story", digest=digest or None)
+        _run_story(Story.read(story), shrink, verbose=verbose)
     chosen = profiles.profiles_named(profile)
     numbers, count = parse_seeds(seeds), check_jobs(jobs)
     search.silence_logs()
@@ -84,9 +86,9 @@ def simulate(
     raise typer.Exit(1 if result.failed else 0)
 
 
-def _run_story(story: Story, *, verbose: bool) -> NoReturn:
-    """Run one story, and exit."""
-    from laneweave.launch.fault_search.search import run_story, silence_logs, timeline_of
+def _run_story(story: Story, shrink: Path | None, *, verbose: bool) -> NoReturn:
+    """Run one story, shrink it if it fails and a file is given, and exit."""
+    from laneweave.launch.fault_search.search import run_story, shrunk, silence_logs, timeline_of
 
     silence_logs()
     for line in timeline_of(story) if verbose else ():
@@ -94,5 +96,8 @@ def _run_story(story: Story, *, verbose: bool) -> NoReturn:
     violations = run_story(story).violations
     for violation in violations:
         typer.echo(str(violation))
+    if shrink is not None and violations:
+        write_atomically(shrink, shrunk(story).text())
+        typer.echo(f"smaller story: {shrink}")
     typer.echo("failed" if violations else "passed")
     raise typer.Exit(1 if violations else 0)

@@ -56,7 +56,8 @@ def make_authority(folder: Path, *, days: float = CA_DAYS) -> Authority:
         BadInputError: an authority exists, or the files cannot be written.
     """
     if ca_path(folder).exists() or authority_key_path(folder).exists():
-        raise BadInputError("DIR", str(folder), "a folder without an authority, or --keep")
+        allowed = "a folder without ca.pem and ca.key; or with both, and --keep"
+        raise BadInputError("DIR", str(folder), allowed)
     key = ec.generate_private_key(ec.SECP256R1())
     name = _name(CA_NAME)
     certificate = (

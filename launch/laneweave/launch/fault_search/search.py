@@ -81,9 +81,11 @@ def run_story(story: Story, rules: Rules = RULES, *, digest: bool = False) -> Se
     try:
         return FaultRun(story, rules, digest=digest).run()
     except Exception as error:  # noqa: BLE001 (the search continues after any error of a core)
-        text = f"{type(error).__name__}: {error}"
-        crash = Violation("crash", 0.0, (), text)
-        return SeedResult(story.seed, (crash,), Totals(runs=1))
+        return SeedResult(story.seed, (_crash(error),), Totals(runs=1))
+
+
+def _crash(error: Exception) -> Violation:
+    return Violation("crash", 0.0, (), f"{type(error).__name__}: {error}")
 
 
 def search(
@@ -264,11 +266,16 @@ def describe_totals(totals: Totals) -> Iterator[str]:
 
 
 def timeline_of(story: Story) -> Iterator[str]:
-    """Run a story and yield the timeline around its first violation."""
+    """Run a story and yield the timeline around its first violation, or until it crashed."""
     timeline = Timeline()
-    outcome = FaultRun(story, timeline=timeline).run()
     yield f"{story.name}:"
-    yield from timeline.around(outcome.violations)
+    try:
+        outcome = FaultRun(story, timeline=timeline).run()
+    except Exception as error:  # noqa: BLE001 (any error of a core)
+        yield from timeline.around(())
+        yield str(_crash(error))
+    else:
+        yield from timeline.around(outcome.violations)
 
 
 def shrunk(story: Story, rules: Rules = RULES) -> Story:

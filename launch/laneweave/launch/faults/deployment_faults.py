@@ -205,6 +205,7 @@ class DeploymentFaults:
                     while not self._stop and not injection.finished and not self._road_ended:
                         injection.step(self._view.t_s, time.monotonic(), self._view)
                         self._report_waiting(injection)
+                        self._report_end(injection)
                         observer.wait(POLL_S)
                 finally:
                     injection.resume_paused()
@@ -226,6 +227,12 @@ class DeploymentFaults:
                 network = self.settings.network
                 self.warn(f"waiting for a road in realm {network.realm} at {network.endpoint}")
                 warn_s = None
+
+    def _report_end(self, injection: FaultInjection) -> None:
+        """Report once that the bridge was killed: without it, road time stands still."""
+        if injection.end and not injection.finished and injection.end not in self._waits:
+            self._waits.add(injection.end)
+            self.warn(f"{injection.end}: the other faults wait for a new bridge")
 
     def _report_waiting(self, injection: FaultInjection) -> None:
         for event in injection.waiting:

@@ -110,8 +110,9 @@ class FaultInjection:
     """Due events that wait for a target."""
     _recoveries: list[Recovery] = field(factory=list)
     """Pending resumes and restarts."""
-    _targets: dict[str, set[str]] = field(factory=dict)
-    """Targets of each fault; a fault affects each agent at most once."""
+    _targets: dict[tuple[str, int], set[str]] = field(factory=dict)
+    """Targets of each fault and repetition. A fault affects each agent at most once, and each
+    coordinator at most once in a repetition."""
     _paused: set[str] = field(factory=set)
     _began: set[str] = field(factory=set)
     """Names of the rules, partitions and faults of links that have begun."""
@@ -199,7 +200,7 @@ class FaultInjection:
 
     def unused_faults(self) -> list[str]:
         """Return a line for each fault that had no effect."""
-        return self.schedule.unused_faults(set(self._targets)) + [
+        return self.schedule.unused_faults({name for name, _ in self._targets}) + [
             f"{name}: {' and '.join(rule.names)} did not run while it was in force"
             for name, rule in self._unmet.items()
             if name in self._began
@@ -251,10 +252,13 @@ class FaultInjection:
         running = [name for name in self.roles.running if name not in self._paused]
         target = event.fault.target
         if target in (COORDINATOR, AGENT):
-            candidates = sorted(
-                self._names_of(target, view)
-                & set(running) - self._targets.get(event.fault_name, set())
-            )
+            earlier = {
+                name
+                for (fault, repetition), names in self._targets.items()
+                if fault == event.fault_name and (target == AGENT or repetition == event.repetition)
+                for name in names
+            }
+            candidates = sorted(self._names_of(target, view) & set(running) - earlier)
             return event.draw.choice(candidates) if candidates else None
         name = view.leader if target == LEADER else target
         if name not in running:
@@ -271,7 +275,7 @@ class FaultInjection:
 
     def _apply(self, event: FaultEvent, name: str, now_s: float, view: RoadView) -> None:
         fault = event.fault_name
-        self._targets.setdefault(fault, set()).add(name)
+        self._targets.setdefault((fault, event.repetition), set()).add(name)
         self._record(fault, event.fault.verb, name)
         if event.for_s is not None:
             self.roles.pause(name)
@@ -338,7 +342,7 @@ class FaultInjection:
         return process in running or self.roles.agent_of(process) in running
 
     def _set_links(self) -> None:
-        """Let the network's links be as the faults in force say."""
+        """Set each link to the state that the faults in force require."""
         if self.network is None:
             return
         links: dict[str, Link] = {}

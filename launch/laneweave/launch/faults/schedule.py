@@ -32,6 +32,8 @@ class FaultEvent:
     """Length of a pause in wall-clock seconds."""
     restart_after_s: float | None = None
     """Wall-clock seconds between a kill and the restart; None: no restart."""
+    repetition: int = 0
+    """Number of the repetition, in which each coordinator is chosen at most once."""
 
 
 class FaultSchedule:
@@ -102,7 +104,8 @@ def _events(seed: int, name: str, fault: RoleFault) -> Iterator[FaultEvent]:
             before, after = (int(fault.restart_share * (number + n) + 1e-9) for n in (0, 1))
             if after > before:
                 restart_after_s = fault.restart_after_s
-        yield FaultEvent(name, fault, due_s, draw, for_s, restart_after_s)
+        repetition = number // fault.count
+        yield FaultEvent(name, fault, due_s, draw, for_s, restart_after_s, repetition)
 
 
 def _times(seed: int, name: str, fault: RoleFault) -> Iterator[float]:

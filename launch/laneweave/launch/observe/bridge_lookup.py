@@ -45,9 +45,17 @@ def settings_of_bridge(access: Access, wait_s: float = HEARD_S) -> ProcessSettin
     Raises:
         BadInputError: there is no router at the endpoint.
     """
-    view = _look(access, wait_s, lambda view: bool(view.processes.settings))
-    found = [one for one in view.processes.settings.values() if one.role == BRIDGE]
-    return max(found, key=lambda one: one.incarnation, default=None)
+
+    def newest(view: RoadView) -> ProcessSettings | None:
+        found = [one for one in view.processes.settings.values() if one.role == BRIDGE]
+        return max(found, key=lambda one: one.incarnation, default=None)
+
+    def suffices(view: RoadView) -> bool:
+        # Other processes publish their settings, too, and the token of an old bridge may remain.
+        found = newest(view)
+        return found is not None and found.incarnation >= max(view.bridge_tokens, default=0)
+
+    return newest(_look(access, wait_s, suffices))
 
 
 def _hears_bridge(view: RoadView) -> bool:

@@ -9,7 +9,7 @@ it has lasted for the rule's `lasts_s`.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from typing import ClassVar, Final
 
 from attrs import define, field, frozen
@@ -219,16 +219,20 @@ def _formations_without_plan(view: RoadView) -> str:
     known = {state.block for state in states} - unattended
     waiting: list[ClosedFormation] = []
     for one in sorted(view.census.formations, key=lambda one: one.closed_s):
-        blocks = one.blocks
-        if accepted.intersection(blocks):
+        if _in_formation(one, accepted):
             waiting = []
-        elif view.t_s - one.closed_s >= UNPLANNED_S and unattended.isdisjoint(blocks):
-            waiting += [one] if known.intersection(blocks) else []
+        elif view.t_s - one.closed_s >= UNPLANNED_S and not _in_formation(one, unattended):
+            waiting += [one] if _in_formation(one, known) else []
     if not waiting:
         return ""
     have = "formation has" if len(waiting) == 1 else f"{len(waiting)} formations have"
     longest_s = view.t_s - waiting[0].closed_s
     return f"the newest closed {have} no plan, for up to {longest_s:.0f} s"
+
+
+def _in_formation(formation: ClosedFormation, blocks: Collection[int]) -> bool:
+    """Return whether any of some blocks are in a formation, however long it claims to be."""
+    return any(formation.first_block <= block <= formation.last_block for block in blocks)
 
 
 def _vehicles_without_plan(observed: Observed) -> str:

@@ -87,6 +87,8 @@ class RoadView:
     incarnation: int = 0
     """Incarnation of the leader."""
     term: int = 0
+    _leading: tuple[Name, int] | None = None
+    """Name and incarnation of the process that last claimed to lead."""
     states: dict[Name, VehicleState] = field(factory=dict)
     """Newest state of each vehicle."""
     road: NewestRoad = field(factory=lambda: NewestRoad(HIGHEST_PACE))
@@ -249,6 +251,7 @@ class RoadView:
         if heartbeat.leading and heartbeat.term >= self.term:
             self.leader, self.incarnation = heartbeat.coordinator, heartbeat.incarnation
             self.term = heartbeat.term
+            self._leading = heartbeat.coordinator, heartbeat.incarnation
         self.heartbeats[heartbeat.coordinator, heartbeat.incarnation] = heartbeat, now_s
 
     def _on_token(self, event: PeerUp | PeerDown) -> None:
@@ -257,6 +260,9 @@ class RoadView:
             process = Name(parameters["coordinator"]), incarnation_of(parameters)
             _update(self.coordinator_tokens, process, present=up)
             _update(self.departed, process, present=not up)
+            if process == self._leading and not up:
+                # If all candidates have been restarted, terms begin anew.
+                self.term = 0
         elif topic is BRIDGE_ALIVE:
             _update(self.bridge_tokens, incarnation_of(parameters), present=up)
         elif topic is VEHICLE_ALIVE:

@@ -28,7 +28,7 @@ live frames are sent on request.
 | `t`, `w` | road time, null before the first clock; wall-clock time, null if recorded |
 | `status` | `lost`: no router; `waiting`: no road; `still`: no clock; `live`, `ended`, `recorded` |
 | `since` | wall-clock time at which the status began; null if recorded |
-| `findings` | what is wrong, the gravest first: list of [process, what, advice] |
+| `findings` | what is wrong, the gravest first: list of [process, what, advice]; recorded: none |
 | `leader` | [name, term], or null |
 | `candidates` | list of [name, term, leading, silent] |
 | `counts` | [demanded, entered, on the road, left], or null |

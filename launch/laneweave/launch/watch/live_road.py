@@ -117,6 +117,7 @@ class LiveRoad:
         self._forget_departed()
         clock, formations = view.clock, self._formations()
         rows = self._rows(clock.t_s, formations) if clock is not None else ()
+        findings = [[one.process, one.what, one.advice] for one in self.findings]
         return {
             "n": number,
             "run": view.roads,
@@ -124,7 +125,7 @@ class LiveRoad:
             "w": round(wall_s, 3),
             "status": self._status,
             "since": round(self._since_s, 3),
-            "findings": [[one.process, one.what, one.advice] for one in self.findings],
+            "findings": findings + self._lanes_missing(),
             **self._leadership(wall_s),
             "counts": [clock.demanded, clock.entered, clock.on_road, clock.left] if clock else None,
             "plan": self._plan,
@@ -207,10 +208,31 @@ class LiveRoad:
         return Formations.of_census(census.formations, self.scenario.lattice)
 
     def _rows(self, t_s: float, formations: Formations) -> Iterator[Row]:
+        for name, (entry, state) in self._vehicles().items():
+            if self._has_lanes_of(entry, state):
+                yield self._row(name, t_s, entry, state, formations)
+
+    def _vehicles(self) -> dict[Name, tuple[CensusEntry | None, VehicleState | None]]:
+        """Return what is known about each vehicle: from the census, and from itself."""
         census, states = self.view.census, self.view.states
         listed = {entry.vehicle: entry for entry in census.on_road} if census is not None else {}
-        for name in {**listed, **states}:
-            yield self._row(name, t_s, listed.get(name), states.get(name), formations)
+        return {name: (listed.get(name), states.get(name)) for name in {**listed, **states}}
+
+    def _has_lanes_of(self, entry: CensusEntry | None, state: VehicleState | None) -> bool:
+        """Return whether the page's scenario has the lanes of a vehicle."""
+        cells = [entry.cell] if entry is not None else []
+        if state is not None:
+            cells += [state.hold_cell, *state.record.owned]
+        return all(0 <= lane < self.scenario.road.lanes for _, lane in cells)
+
+    def _lanes_missing(self) -> list[list[str]]:
+        """Return a row of the field `findings` if the scenario lacks the lanes of vehicles."""
+        hidden = sum(not self._has_lanes_of(*known) for known in self._vehicles().values())
+        if not hidden:
+            return []
+        lanes = self.scenario.road.lanes
+        what = f"the page shows {lanes} lanes; vehicles in other lanes, not shown: {hidden}"
+        return [["watch", what, "start it with the road's scenario: --config FILE"]]
 
     def _row(
         self,

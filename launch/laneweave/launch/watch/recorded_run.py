@@ -120,6 +120,7 @@ class RecordedFrames:
             "w": None,
             "status": "recorded",
             "since": None,
+            "findings": [],
             "leader": moment.leader,
             "candidates": [],
             "counts": [demanded, moment.entered, len(rows), moment.left],

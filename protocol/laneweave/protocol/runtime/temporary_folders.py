@@ -1,8 +1,8 @@
 """Temporary folders that do not outlive their processes, even if these are killed.
 
 A folder contains a file that its processes keep locked. The kernel releases the lock when the last
-of them ends, however it ends; so whoever holds the lock alone may remove the folder. Process ids
-would not do: they are reused, and containers that share a temporary folder number their own.
+of them ends, however it ends; so a process that holds the lock alone may remove the folder. Process
+ids would not do: they are reused, and containers that share a temporary folder number their own.
 """
 
 from __future__ import annotations

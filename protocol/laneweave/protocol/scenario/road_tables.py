@@ -49,7 +49,7 @@ class RoadEvent:
     speed_mps: float = field(default=0.0, validator=within(0.0, 60.0))
     """Speed of a vehicle of another system; 0: a closed part."""
     clear_s: float = field(default=20.0, validator=within(0.0, 600.0))
-    """Time for which the lane is cleared at most, until nobody need brake hard for the part, or
+    """Time for which the lane is cleared at most, until no vehicle need brake hard for the part, or
     for the vehicle that enters."""
 
     def ends_s(self, since_s: float) -> float:

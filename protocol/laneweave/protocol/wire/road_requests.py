@@ -34,7 +34,7 @@ class RoadRequest:
     for_s: float | None = field(default=None, validator=optional(_time))
     """Time for which it is closed [s of road time]; None: until it is opened."""
     clear_s: float = field(default=20.0, validator=within(0.0, LONGEST_CLEAR_S))
-    """Time for which it is cleared at most, until nobody need brake hard for it."""
+    """Time for which it is cleared at most, until no vehicle need brake hard for it."""
 
     def to_dict(self) -> dict[str, Any]:
         """Return the request as a map."""

@@ -114,7 +114,7 @@ class LaneGaps:
     def _holds_up(self, ahead: Neighbour, speed_mps: float) -> bool:
         """Return whether one that stops ahead would stop this vehicle before it has left the lane.
 
-        It would then stand in both lanes, and nobody could pass it.
+        It would then stand in both lanes, and no vehicle could pass it.
         """
         if ahead.speed_mps > self._speed_mps - STOPPING_MPS and ahead.accel_mps2 > STOPPING_MPS2:
             return False

@@ -29,7 +29,7 @@ from laneweave.sim_bridge.road.demand_queue import OnRoad, OnRoadT
 REACTION_S = 0.5
 """Time in which a vehicle that is given back keeps its speed."""
 AS_FAST_MPS = 0.5
-"""Difference to v_F up to which nobody has to brake for a vehicle."""
+"""Difference to v_F up to which no vehicle has to brake for a vehicle."""
 STANDING_MPS, STANDING_M = 1.0, 8.0
 """Speed below which a vehicle stands, and its distance from another one of the same queue."""
 STUCK_MPS = 0.1
@@ -93,7 +93,7 @@ class HandOver:
     def plans_end(self, others: Iterable[OtherBody]) -> tuple[OffLattice, ...]:
         """Return lanes with positions beyond which no plan may use them.
 
-        Only lanes to the end of the road: whoever is beyond could not leave its lane any more.
+        Only lanes to the end of the road: a vehicle beyond could not leave its lane.
         """
         ends = [
             OffLattice(section.lane, max(line_m - PLANS_END_M, section.from_m, 0.0))

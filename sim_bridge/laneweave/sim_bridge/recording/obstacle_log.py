@@ -45,17 +45,29 @@ class ObstacleLog:
             lowest_mps = round(obstacle.speed_mps, 3)
         self._change(number, to_m=obstacle.to_m, opened_s=opened_s, lowest_speed_mps=lowest_mps)
 
-    def on_lane_end(self, t_s: float, vehicle: Name, lane: int, kind: str) -> None:
+    def on_lane_end(self, t_s: float, vehicle: Name, lane: int, kind: str, s_m: float) -> None:
         """Note that a vehicle has no cell any more, or has one again."""
         if kind == LEFT_LATTICE:
-            here = [number for place, number in self._active.items() if place[0] == lane]
-            if here and self._figures[here[-1]].vehicle != vehicle:
-                self._waits[vehicle] = here[-1], t_s
-                self._change(here[-1], stopped=self._figures[here[-1]].stopped + 1)
+            number = self._ahead(lane, s_m)
+            has_broken_down = any(vehicle == own for _, _, own in self._active)
+            if number is not None and not has_broken_down:
+                self._waits[vehicle] = number, t_s
+                self._change(number, stopped=self._figures[number].stopped + 1)
         elif kind == ENTERED_LATTICE and vehicle in self._waits:
             number, since_s = self._waits.pop(vehicle)
             waited_s = round(self._figures[number].waited_s + t_s - since_s, 6)
             self._change(number, waited_s=waited_s)
+
+    def _ahead(self, lane: int, s_m: float) -> int | None:
+        """Return the part for which a vehicle stops: the next one ahead, or a passing vehicle."""
+        here = [number for place, number in self._active.items() if place[0] == lane]
+        moving = [number for number in here if self._figures[number].cause == PASSING]
+        ahead = [
+            number for number in here if number not in moving and self._figures[number].to_m > s_m
+        ]
+        if ahead:
+            return min(ahead, key=lambda number: self._figures[number].from_m)
+        return moving[-1] if moving else None
 
     @property
     def figures(self) -> list[ObstacleFigures] | None:

@@ -33,7 +33,7 @@ class RoadRecord(Protocol):
     def on_left(self, vehicle: RecordedVehicle, t_s: float, *, attended: bool) -> None:
         """Record a vehicle that has left the road since the last tick."""
 
-    def on_lane_end(self, t_s: float, vehicle: Name, lane: int, kind: str) -> None:
+    def on_lane_end(self, t_s: float, vehicle: Name, lane: int, kind: str, s_m: float) -> None:
         """Record that a vehicle has left the lattice at a dead end, or comes back."""
 
     def on_obstacle(self, t_s: float, kind: str, obstacle: Obstacle) -> None:

@@ -298,10 +298,10 @@ class RunRecord:
                 **reasons,
             )
 
-    def on_lane_end(self, t_s: float, vehicle: Name, lane: int, kind: str) -> None:
+    def on_lane_end(self, t_s: float, vehicle: Name, lane: int, kind: str, s_m: float) -> None:
         """Record that a vehicle has left the lattice at a dead end, or comes back; see `events`."""
         self._missed_lanes.on_lane_end(vehicle, kind)
-        self._obstacles.on_lane_end(t_s, vehicle, lane, kind)
+        self._obstacles.on_lane_end(t_s, vehicle, lane, kind, s_m)
         if kind == LEFT_LATTICE:
             self._counts.stopped.add(vehicle)
         self.event(t_s, kind, vehicle=vehicle, lane=lane)

@@ -89,12 +89,6 @@ def metadata_of(scenario: Scenario) -> Metadata:
     return {SCENARIO_KEY: json.dumps(to_tables(scenario)).encode()}
 
 
-def trips_table(trips: Iterable[Trip], last_arrival_s: float, metadata: Metadata) -> pa.Table:
-    """Return the table of trips; `last_arrival_s` is the road time of the last arrival."""
-    rows = [trip.row(last_arrival_s) for trip in trips]
-    return pa.Table.from_pylist(rows, schema=TRIPS.arrow_schema(metadata))
-
-
 class Trips:
     """Writer of trips, in order of arrival; stores only those that it has not written yet."""
 

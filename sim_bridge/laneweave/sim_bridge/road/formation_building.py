@@ -19,7 +19,7 @@ must fit into those that remain.
 Vehicles from ramps join the formation whose columns pass, if it has room. It is closed when its
 columns have passed all entrances.
 
-For vehicles that waited at the end of a lane, columns are *reserved*: nobody enters them, in any
+For vehicles that waited at the end of a lane, columns are *reserved*: no vehicle enters them, in any
 lane. The vehicle that drives into them is a formation of its own.
 """
 
@@ -102,7 +102,7 @@ class ColumnBlocks:
     _vehicles: dict[int, Vehicles] = field(factory=dict)
     """Vehicles of each block that is not closed."""
     _reserved: set[int] = field(factory=set)
-    """Blocks that nobody may enter and that are not closed."""
+    """Blocks that no vehicle may enter and that are not closed."""
     _next: int = field(init=False)
     """Next block to be closed."""
 

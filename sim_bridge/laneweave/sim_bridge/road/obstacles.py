@@ -6,7 +6,7 @@ vehicles change lanes before it, or stop before it and re-enter the lattice.
 
 A part that is to be closed is cleared first, while vehicles are in it or could not stop before it:
 vehicles leave it, and none enters it. A part stays closed until its cause is over and no vehicle
-waits there any more. Vehicles that wait then start in their own lane, which nobody else uses.
+waits there any more. Vehicles that wait then start in their own lane, which no other vehicle uses.
 """
 
 from __future__ import annotations
@@ -235,8 +235,8 @@ class Obstacles:
         self, part: TemporaryClosure, vehicles: Mapping[Name, RoadVehicle]
     ) -> VehiclesInPart:
         """Return the vehicles in the way of a part that is to be closed."""
-        everybody: list[BodyOnRoad] = [*vehicles.values(), *self.passing.on_road]
-        return vehicles_in_part(self._scenario, *part[:3], everybody)
+        bodies: list[BodyOnRoad] = [*vehicles.values(), *self.passing.on_road]
+        return vehicles_in_part(self._scenario, *part[:3], bodies)
 
     def _follow_passing(self, vehicles: Mapping[Name, RoadVehicle], t_s: float) -> None:
         """Close the parts in which slow vehicles of other systems are now; end earlier ones."""

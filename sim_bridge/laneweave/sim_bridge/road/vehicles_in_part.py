@@ -59,7 +59,7 @@ class VehiclesInPart:
     """Those that could not stop at the stop line before it."""
 
     def allow_closing(self, *, waits: bool) -> bool:
-        """Return whether the part may be closed; `waits`: only if nobody has to brake hard."""
+        """Return whether the part may be closed; `waits`: only if no vehicle has to brake hard."""
         return not (self.inside or self.near or (self.coming and waits))
 
     @property

@@ -30,6 +30,21 @@ def test_too_many_vehicles_for_a_block_are_refused() -> None:
         FAMILIES["block"].request(0, 13, 4.0)
 
 
+def test_sizes_are_refused_before_anything_is_measured() -> None:
+    found = bench_planner(
+        [2, 13], ["node-edge", "block"], instances=1, seed=5, deadline_s=4.0, solver="tappa"
+    )
+    with pytest.raises(BadInputError, match="13 vehicles do not fit"):
+        next(found)
+
+
+def test_formations_of_traffic_have_fewer_vehicles_than_the_most() -> None:
+    (row,) = bench_planner(
+        [36], ["traffic"], instances=2, seed=5, deadline_s=4.0, solver="branching"
+    )
+    assert (row["vehicles"], row["mean_vehicles"] < 14.0) == (36, True)
+
+
 def test_plans_without_a_proof_have_a_gap() -> None:
     response = plan(formation_request(0, vehicles=4))
     assert gap_percent(response) == 0.0

@@ -92,6 +92,15 @@ def test_each_identity_has_a_folder_that_is_enough_for_it(laneweave: Here, confi
     assert (folder / "bridge" / "ca.pem").read_bytes() == (folder / "ca.pem").read_bytes()
 
 
+def test_an_authority_that_lacks_a_file_is_not_replaced(laneweave: Here, tmp_path: Path) -> None:
+    folder = tmp_path / "certs"
+    assert laneweave("certs", "init", folder)[0] == 0
+    (folder / "ca.pem").unlink()
+    for options in ([], ["--keep"]):
+        refused = laneweave.refused("certs", "init", folder, *options)
+        assert "without ca.pem and ca.key; or with both, and --keep" in refused
+
+
 def test_one_more_certificate(laneweave: Here, tmp_path: Path) -> None:
     folder = tmp_path / "certs"
     assert laneweave("certs", "init", folder)[0] == 0

@@ -6,6 +6,7 @@ import contextlib
 import signal
 import subprocess
 import time
+from unittest.mock import Mock
 
 import psutil
 import pytest
@@ -99,6 +100,14 @@ def test_timeline_of_a_run() -> None:
     told = "\n".join(lines)
     for words in ("PREPARE", "PLAN", "STATE", "COMMAND", "moves", "all faults end", "*** v01"):
         assert words in told
+
+
+def test_timeline_of_a_crash(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(FaultRun, "run", Mock(side_effect=ValueError("no")))
+    first, *_, last = timeline_of(Story.drawn(1, CALM))
+    assert first == "calm 1:"
+    assert "crash" in last
+    assert "ValueError: no" in last
 
 
 @pytest.mark.more

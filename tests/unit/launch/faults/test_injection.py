@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import pytest
 from attrs import define, field
 
 from laneweave.launch.faults.fault_file import FaultSpec, Kill, Partition, Pause
@@ -114,6 +115,17 @@ def test_each_target_is_chosen_at_most_once(target: str, names: list[str]) -> No
         faults.step(1.0 + step, float(step), view)
     assert sorted(name for verb, name in roles.done if verb == "kill") == names
     assert sorted(name for verb, name in roles.done if verb == "start") == names
+
+
+@pytest.mark.parametrize("times", [{"at_s": 10.0, "every_s": 5.0}, {"between_s": (10.0, 60.0)}])
+def test_coordinators_are_killed_again_in_the_next_repetition(times: dict[str, Any]) -> None:
+    roles, view = FakeRoles(), on_road()
+    kill = Kill(target="coordinator", times=10, restart_after_s=0.5, **times)
+    faults = injection(roles, kill=(kill,))
+    for step in range(100):
+        faults.step(float(step), float(step), view)
+    assert len([name for verb, name in roles.done if verb == "kill"]) == 10
+    assert faults.finished
 
 
 def test_the_choice_among_agents_is_drawn_from_the_seed() -> None:

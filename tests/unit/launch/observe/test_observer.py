@@ -6,11 +6,12 @@ from msgspec.structs import replace
 
 from laneweave.launch.observe.observer import Observer
 from laneweave.launch.observe.road_view import RoadView
+from laneweave.protocol.runtime.node import PeerDown, PeerUp
 from laneweave.protocol.runtime.transport import LinkDown, Received, TokenUp
 from laneweave.protocol.wire.bounds import Bounds
 from laneweave.protocol.wire.codec import encode
 from laneweave.protocol.wire.messages import Census, Heartbeat, Name, RoadClock
-from laneweave.protocol.wire.topics import HEARTBEAT, Keys
+from laneweave.protocol.wire.topics import COORDINATOR_ALIVE, HEARTBEAT, Keys
 
 HUGE = 2**63 - 1
 
@@ -55,6 +56,21 @@ def test_the_highest_term_leads() -> None:
     assert (view.leader, view.term) == ("c2", 3)
     view.update(heartbeat("c1", 4), 0.0)
     assert (view.leader, view.term) == ("c1", 4)
+
+
+def test_terms_begin_anew_if_the_leader_and_all_others_are_restarted() -> None:
+    view = RoadView()
+    for name, term in (("c1", 1), ("c2", 2)):
+        parameters = {"coordinator": name, "incarnation": "1"}
+        view.update(PeerUp(COORDINATOR_ALIVE, parameters), 0.0)
+        view.update(heartbeat(name, term), 0.0)
+    view.leader = None  # as `Failover` does
+    view.update(PeerDown(COORDINATOR_ALIVE, {"coordinator": "c1", "incarnation": "1"}), 1.0)
+    view.update(heartbeat("c1", 1), 1.0)
+    assert view.leader is None  # the highest term is that of a process that runs
+    view.update(PeerDown(COORDINATOR_ALIVE, {"coordinator": "c2", "incarnation": "1"}), 1.0)
+    view.update(replace(heartbeat("c1", 1), incarnation=2), 2.0)
+    assert (view.leader, view.term) == ("c1", 1)
 
 
 def test_an_observer_ignores_malformed_messages() -> None:

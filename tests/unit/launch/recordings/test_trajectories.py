@@ -15,9 +15,10 @@ from laneweave.protocol.scenario.fields import Scenario
 from laneweave.sim_bridge.recording.columns import SCHEMA_KEY, TRAJECTORIES
 from laneweave.sim_bridge.recording.driving_measures import DrivingMeasures
 from laneweave.sim_bridge.recording.trajectories import Sample, Trajectories
-from laneweave.sim_bridge.recording.trips import Trip, metadata_of, trips_table
+from laneweave.sim_bridge.recording.trips import Trip, metadata_of
 from laneweave.sim_bridge.road.demand import Arrival
 from support.older_recordings import first_schema
+from support.recorded_trips import trips_table
 from support.tables import for_each
 
 SCENARIO = Scenario()

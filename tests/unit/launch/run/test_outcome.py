@@ -19,9 +19,10 @@ from laneweave.protocol.errors import BadInputError, CommandFailedError
 from laneweave.protocol.summary import RunSummary, write_summary
 from laneweave.sim_bridge.corridors.sumo_corridor import read_corridor
 from laneweave.sim_bridge.corridors.sumo_simulation import WHOLE
-from laneweave.sim_bridge.recording.trips import metadata_of, trips_table
+from laneweave.sim_bridge.recording.trips import metadata_of
 from support.closed_lanes import DROP
 from support.interchange import CORRIDOR, TRUCKS, stream, write_interchange
+from support.recorded_trips import trips_table
 from support.summaries import make_summary
 from support.tables import for_each
 

@@ -157,6 +157,23 @@ def test_a_vehicle_that_is_not_listed_yet_is_shown_without_a_lane() -> None:
     assert shown(road)["vehicles"][-1][4] == -1
 
 
+def test_vehicles_in_lanes_that_the_page_lacks_are_reported() -> None:
+    """As on a road with more lanes than the page's scenario, or by a forged state."""
+    road = watched()
+    state = CONVOY.state(3, START + 20)
+    road.update(replace(state, hold_cell=(state.hold_cell[0], 99)), 2.0)
+    census = CONVOY.census(START + 21)
+    first = replace(census.on_road[0], cell=(census.on_road[0].cell[0], 3))
+    road.update(replace(census, on_road=(first, *census.on_road[1:])), 2.0)
+    frame = shown(road)
+    assert [row[0] for row in frame["vehicles"]] == [
+        name for number, name in enumerate(CONVOY.names) if number not in {0, 3}
+    ]
+    assert ["watch", "the page shows 3 lanes; vehicles in other lanes, not shown: 2"] in [
+        row[:2] for row in frame["findings"]
+    ]
+
+
 def with_formations(
     scenario: Scenario, count: int, *closed: ClosedFormation
 ) -> tuple[LiveRoad, Convoy]:

@@ -34,9 +34,9 @@ from laneweave.sim_bridge.recording.trips import (
     metadata_of,
     throughput,
     travel_time,
-    trips_table,
 )
 from laneweave.sim_bridge.road.demand import Arrival
+from support.recorded_trips import trips_table
 
 METADATA = metadata_of(Scenario())
 LATTICE = Scenario().lattice

@@ -240,8 +240,9 @@ class LightRoad:
     def on_obstacle(self, t_s: float, kind: str, obstacle: Obstacle) -> None:
         """Do nothing."""
 
-    def on_lane_end(self, t_s: float, vehicle: Name, lane: int, kind: str) -> None:
+    def on_lane_end(self, t_s: float, vehicle: Name, lane: int, kind: str, s_m: float) -> None:
         """Let a body stop before the end of its lane, and come back; see `LaneEndControl`."""
+        del s_m
         one, now_s = self.vehicles[vehicle], self.began_s + t_s
         body, cell = one.body, one.cell
         if kind in {MISSED_EXIT, MOVE_TAKEN_BACK}:
