@@ -110,6 +110,7 @@ class AgentCore:
         self._claim = _Claim(new_incarnation)
         runtime = scenario.runtime
         self._bounds = runtime.bounds(self._claim.incarnation)
+        self._durations = scenario.timing.move_durations
         self._road = NewestRoad(runtime.max_pace)
         self._make_driver = make_driver
         self._vehicle_type: str = CAR
@@ -210,6 +211,9 @@ class AgentCore:
                 if execution.on_prepare(message):
                     return [*self._request_storage(execution), self._state()]
             case Plan():
+                if self._scenario.timing.move_ticks(message.slot_s) not in self._durations:
+                    slots_s = ", ".join(f"{slot_s:g}" for slot_s in self._scenario.timing.slots_s)
+                    return [Refuse(BadInputError("slot_s", message.slot_s, f"one of {slots_s}"))]
                 if execution.on_plan(message) or self._waking:
                     return self._request_storage(execution)
             case _:

@@ -11,6 +11,7 @@ import structlog
 from attrs import frozen
 
 from laneweave.coordinator.election import Election
+from laneweave.coordinator.entry_cells import EntryCells
 from laneweave.coordinator.formations.leader import LEADER_RULES
 from laneweave.coordinator.formations.operation import FormationsOperation
 from laneweave.coordinator.operation import LogEntry, Operation, Outcome, ToVehicle
@@ -138,8 +139,7 @@ class CoordinatorCore:
         self._road_number = 0
         """Number of the road that the census and the operation are about."""
         self.census: Census | None = None
-        self._formation_of: dict[Name, int] = {}
-        """Block that each vehicle in the census entered."""
+        self._entry_cells = EntryCells(scenario)
         self._processes_of: dict[Name, tuple[Name, ...]] = {}
         """Processes with an agent for each vehicle in the census."""
         self._handled_s = self._awake_since_s = 0.0
@@ -239,6 +239,8 @@ class CoordinatorCore:
         match event:
             case Arrived(_, _, message):
                 self._bounds.check(message, road.latest_s(now_s), now_s)
+                if isinstance(message, VehicleState):
+                    self._entry_cells.check(message)
                 if isinstance(message, (RoadClock, Census, Obstacles)):
                     self._of_this_road = road.on_message(message.bridge, message.t_s, now_s)
             case PeerUp(_, {"incarnation": _} as parameters):
@@ -260,7 +262,8 @@ class CoordinatorCore:
         self._road_number = self._road.number
         self.census = None
         self._obstacles_s = -math.inf
-        self._formation_of, self._processes_of = {}, {}
+        self._entry_cells.update(())
+        self._processes_of = {}
         self.operation.forget()
 
     def _on_event(self, event: Event, now_s: float) -> Iterator[Effect]:
@@ -341,10 +344,7 @@ class CoordinatorCore:
             case Census():
                 if self.census is None or message.t_s >= self.census.t_s:
                     self.census = message
-                    block_of = self.scenario.lattice.block_of
-                    self._formation_of = {
-                        entry.vehicle: block_of(entry.cell[0]) for entry in message.on_lattice
-                    }
+                    self._entry_cells.update(message.on_lattice)
                     self._processes_of = {
                         entry.vehicle: entry.processes for entry in message.on_road
                     }
@@ -357,7 +357,7 @@ class CoordinatorCore:
 
         A leader ignores vehicles that its census does not list, for example departed ones.
         """
-        if self.election.leading and self._formation_of.get(state.vehicle) == state.block:
+        if self.election.leading and self._entry_cells.has_entry_of(state):
             return self.operation.on_state(state, now_s)
         return None
 

@@ -321,7 +321,7 @@ class BridgeCore:
             case Prepare() | Plan():
                 yield from self.road.on_ballot(Name(parameters["vehicle"]), message)
             case Report():
-                self._on_report(message, parameters, now_s)
+                self._on_report(message, now_s)
             case LogEvent():
                 self._record.on_event(message)
             case Heartbeat():
@@ -343,15 +343,11 @@ class BridgeCore:
         in_time = command.tick == self.tick and self.phase is TickPhase.ANSWERS
         return self.road.on_command(command, now_s, in_time=in_time)
 
-    def _on_report(self, report: Report, parameters: Mapping[str, str], now_s: float) -> None:
+    def _on_report(self, report: Report, now_s: float) -> None:
         final = report.role in ("agent", "bridge")
         if final and report.name not in self._unreported:
             return  # from an earlier run, or a duplicate
         self.road.bounds.check(report, self.t_s, now_s)
-        key = parameters["role"], parameters["name"]
-        if key != (report.role, report.name):
-            # The rights of a sender are those for its key.
-            raise BadInputError("name", f"{report.role} {report.name}", " ".join(key))
         if final:
             self._unreported.discard(report.name)
         self._record.on_report(report)

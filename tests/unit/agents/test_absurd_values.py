@@ -10,7 +10,15 @@ from msgspec.structs import replace
 from laneweave.agents.core import AgentCore
 from laneweave.agents.host import AgentHost
 from laneweave.launch.fault_search.road.stand_ins import LightDriver
-from laneweave.protocol.runtime.node import Announce, Arrived, Effect, PeerDown, PeerUp, Refuse
+from laneweave.protocol.runtime.node import (
+    Announce,
+    Arrived,
+    Effect,
+    PeerDown,
+    PeerUp,
+    Refuse,
+    Started,
+)
 from laneweave.protocol.scenario.deployment_fields import Shard
 from laneweave.protocol.wire.bounds import CLAIM_AHEAD_NS, DAY_NS, max_term
 from laneweave.protocol.wire.identities import above
@@ -26,9 +34,18 @@ from laneweave.protocol.wire.messages import (
     VehicleState,
 )
 from laneweave.protocol.wire.newest import FORGET_S
-from laneweave.protocol.wire.topics import BRIDGE_ALIVE, CENSUS, PREPARE, SENSE, VEHICLE_ALIVE
+from laneweave.protocol.wire.obstacle_messages import Obstacle, Obstacles
+from laneweave.protocol.wire.topics import (
+    BRIDGE_ALIVE,
+    CENSUS,
+    OBSTACLES,
+    PLAN,
+    PREPARE,
+    SENSE,
+    VEHICLE_ALIVE,
+)
 from support.paper import PAPER
-from support.states import BALLOT, sense_in, sent
+from support.states import BALLOT, make_plan, sense_in, sent
 
 HUGE = 2**63 - 1
 ME = Name("me")
@@ -218,3 +235,43 @@ def test_a_shard_returns_to_the_bridge_whose_token_is_left() -> None:
     assert fleet.census() == []
     fleet.token(DAY_NS, up=False)
     assert Announce(VEHICLE_ALIVE, {"process": PROCESS, "vehicle": ME}) in fleet.census()
+
+
+@pytest.mark.parametrize("slot_s", [0.3, 60.0, 1e6])
+def test_slots_of_no_scenario_are_refused(slot_s: float) -> None:
+    """No trajectory fits into the first one, and one of the last one would take hours to make."""
+    seat = Seat()
+    seat.agent.handle(Arrived(PREPARE, {}, Prepare(BALLOT, (0,), (ME,))), seat.now_s)
+    plan = make_plan(
+        {ME: HOME},
+        {ME: ((0, HOME, (-1, 2)),)},
+        incarnations={ME: seat.in_charge},
+        slot_s=slot_s,
+        t0_s=0.0,
+    )
+    (refused,) = seat.agent.handle(Arrived(PLAN, {}, plan), seat.now_s)
+    assert isinstance(refused, Refuse)
+    assert refused.error.field == "slot_s"
+    seat.drive(3)
+
+
+@pytest.mark.parametrize(
+    "parts",
+    [
+        Obstacles(1e12, (Obstacle(0, 0.1, 999.0),), BRIDGE),
+        Obstacles(1.0, (Obstacle(0, 1.0, 8.0, late_m=-1000.0),), BRIDGE),
+        Obstacles(1.0, (), 2**62),
+    ],
+)
+def test_absurd_parts_of_lanes_are_refused(parts: Obstacles) -> None:
+    given = iter(range(BRIDGE + 1, BRIDGE + 100))
+    host = AgentHost(
+        ME, lambda name: AgentCore(name, given.__next__, PAPER), BRIDGE, PAPER.runtime, [ME]
+    )
+    host.handle(Started(), 0.0)
+    host.handle(PeerUp(BRIDGE_ALIVE, {"incarnation": str(BRIDGE)}), 0.0)
+    (refused,) = host.handle(Arrived(OBSTACLES, {}, parts), 1.0)
+    assert isinstance(refused, Refuse)
+    correct = Obstacles(1.0, (Obstacle(2, 600.0, 700.0),), BRIDGE)
+    assert not host.handle(Arrived(OBSTACLES, {}, correct), 1.1)
+    assert host._obstacles == correct

@@ -6,8 +6,10 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
+from attrs import evolve
 from msgspec.structs import replace
 
+from laneweave.coordinator.rolling.operation import RollingOperation
 from laneweave.protocol.runtime.node import (
     Arrived,
     Effect,
@@ -239,3 +241,37 @@ def test_a_leader_sends_only_terms_that_others_accept() -> None:
     sent = [each.message for each in road.effects if isinstance(each, Send)]
     terms = [each.term for each in sent if isinstance(each, Heartbeat)]
     assert 0 < max(terms) <= max_election_term(road.t_s) + 1
+
+
+@pytest.mark.parametrize("operation", ["formations", "rolling"])
+@pytest.mark.parametrize("cell", [(0, 99), (0, -1), (10**9, 0), (-(10**12), 1)])
+def test_hold_cells_where_no_vehicle_can_be_are_refused(
+    operation: str, cell: tuple[int, int]
+) -> None:
+    """Planning would fail in such a lane, and take long with such a column."""
+    formation = evolve(PAPER.formation, operation=operation)
+    desk = Desk(scenario=evolve(PAPER, formation=formation))
+    desk.lead()
+    desk.give(Arrived(CENSUS, {}, census(CELLS, t_s=T_S)))
+    told = state(A, CELLS[A], None, t_s=T_S)
+    (refused,) = desk.give(Arrived(STATE, {}, replace(told, hold_cell=cell)))
+    assert isinstance(refused, Refuse)
+    assert refused.error.field == "hold_cell"
+    near = replace(told, hold_cell=(CELLS[A][0] + 20, 2))
+    assert not [one for one in desk.give(Arrived(STATE, {}, near)) if isinstance(one, Refuse)]
+
+
+def test_on_a_new_road_terms_of_the_old_one_are_forgotten_in_the_rolling_operation() -> None:
+    formation = evolve(PAPER.formation, operation="rolling")
+    desk = Desk(scenario=evolve(PAPER, formation=formation))
+    desk.lead()
+    desk.give(Arrived(CLOCK, {}, clock(30_000.0)))
+    desk.give(Arrived(CENSUS, {}, replace(census(CELLS, t_s=30_000.0), bridge=7)))
+    absurd = Ballot(max_term(30_000.0), Name("zz"), 1, 1)
+    desk.give(Arrived(STATE, {}, state(A, CELLS[A], absurd, t_s=30_000.0)))
+    operation = desk.core.operation
+    assert isinstance(operation, RollingOperation)
+    assert operation._highest == absurd
+    desk.give(PeerUp(BRIDGE_ALIVE, {"incarnation": "8"}))
+    desk.give(Arrived(CLOCK, {}, clock(0.0, bridge=8)))
+    assert operation._highest is None

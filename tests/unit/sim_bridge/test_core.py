@@ -449,14 +449,6 @@ def test_reports_with_impossible_numbers_are_refused_and_add_nothing(
     assert found["tracking"]["solves"] == 3
 
 
-def test_a_report_in_the_name_of_another_is_refused(tmp_path: Path) -> None:
-    # A certificate of a vehicle permits the key of its own report only.
-    desk = wound_up(tmp_path)
-    forged = Report(Name("coordinator"), Name("c1"), rejected=5)
-    (effect,) = desk.give(Arrived(topics.REPORT, {"role": "agent", "name": A}, forged))
-    assert isinstance(effect, Refuse)
-
-
 @pytest.mark.parametrize("stopped", [False, True])
 def test_winding_up_has_a_deadline_and_may_be_stopped(tmp_path: Path, *, stopped: bool) -> None:
     desk = wound_up(tmp_path)

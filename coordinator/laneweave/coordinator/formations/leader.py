@@ -124,10 +124,11 @@ class FormationLeader(BallotRound):
     def on_plan(self, plan: Plan, now_s: float, out_of_reach: Iterable[Name] = ()) -> None:
         """Issue the plan under the promised ballot (L5)."""
         self.out_of_reach = frozenset(out_of_reach)
+        self.awaited_log_s = now_s + AWAITED_S  # planning may have taken longer
         self.take(PLANNED, now_s, plan)
 
     def pop_awaited(self, now_s: float) -> tuple[Name, ...]:
-        """Return the vehicles that have not answered a ballot for `AWAITED_S`; once per ballot."""
+        """Return the vehicles that have not answered for `AWAITED_S`, once in each phase."""
         if self.awaited_log_s is None or now_s < self.awaited_log_s:
             return ()
         match self.phase:
@@ -167,8 +168,13 @@ def all_have_reported(leader: FormationLeader, _: object) -> bool:
 
 
 def one_plan_is_in_force(leader: FormationLeader, _: object) -> bool:
-    """All members have accepted the same ballot, and none is overdue."""
+    """All members have accepted the same ballot, and none is overdue.
+
+    A completed plan may be that of an earlier stage. For sorting, L8 finds out; not for structures.
+    """
     states = [leader.states[name] for name in leader.roster]
+    if leader.formation.stage.structure is not None and all(state.done for state in states):
+        return False
     return len({state.record.promised for state in states}) == 1 and all(
         state.accepted and not state.overdue for state in states
     )

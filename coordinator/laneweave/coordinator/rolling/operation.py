@@ -106,7 +106,7 @@ class RollingOperation:
         self.take_over()
         self.observed.forget()
         self._replaced = ReplacedBallots()
-        self._last_plan, self._newest_slot = None, -1
+        self._last_plan, self._newest_slot, self._highest = None, -1, None
         self._temporary, self._parts_changed = NO_PARTS, False
 
     def take_over(self) -> None:

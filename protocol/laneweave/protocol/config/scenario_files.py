@@ -34,6 +34,7 @@ _CHECKS = (
         motion_checks.check_timing,
         motion_checks.check_braking,
         motion_checks.check_settling,
+        deployment_checks.check_secured_demand,
     ),
     (deployment_checks.check_periods,),
     (deployment_checks.check_radio,),

@@ -453,7 +453,8 @@ def read_message(
     topic, parameters = known_key(keys, key)
     if topic.kind is None:
         raise BadInputError("key", key, "a topic that carries messages")
-    return Arrived(topic, parameters, decode(payload, topic.kind))
+    message = topic.checked(decode(payload, topic.kind), parameters)
+    return Arrived(topic, parameters, message)
 
 
 def _key_of(keys: Keys, event: Event) -> str:

@@ -26,6 +26,7 @@ from laneweave.protocol.wire.messages import (
     VehicleState,
 )
 from laneweave.protocol.wire.newest import AHEAD_S
+from laneweave.protocol.wire.obstacle_messages import Obstacles
 from laneweave.protocol.wire.process_messages import Report
 
 MAX_TERM_AT_START = 200_000
@@ -48,6 +49,8 @@ AHEAD_NS = 2 * DAY_NS
 accept what the bridge has accepted."""
 SUCCESSION_NS = 10**9
 """Maximum lead of a claim over the process in charge, if the latter is itself near the limit."""
+MAX_MOTION_S = 600.0
+"""Maximum time until a motion ends; the longest slots last a minute."""
 MAX_MESSAGES_PER_S = 100_000
 """Maximum mean rate of the messages that a process publishes or receives: a process needs about
 10 us to encode or decode one."""
@@ -127,6 +130,9 @@ class Bounds:
                 self._check_record(message.record, road_s, now_s)
             case Sense():
                 self._check_tick(message.tick, message.t_s, road_s)
+                limit = message.tick + round(MAX_MOTION_S / self.tick_s)
+                if message.motion.end_tick > limit:
+                    raise BadInputError("end_tick", message.motion.end_tick, f"at most {limit}")
                 self.check_incarnation(message.bridge, now_s)
                 self._check_record(message.record, road_s, now_s)
             case Command():
@@ -142,6 +148,8 @@ class Bounds:
                 _check_term(message.term, road_s)
             case Report():
                 self._check_report(message, road_s, now_s)
+            case Obstacles():
+                self._check_obstacles(message, road_s, now_s)
             case _:
                 pass
 
@@ -184,6 +192,14 @@ class Bounds:
         for (duration_ms,) in _DURATION.iter_unpack(report.solve_ms):
             if not 0.0 <= duration_ms <= MAX_SOLVE_MS:
                 raise BadInputError("solve_ms", duration_ms, f"0 to {MAX_SOLVE_MS:g}")
+
+    def _check_obstacles(self, message: Obstacles, road_s: float, now_s: float) -> None:
+        self._check_time(message.t_s, road_s)
+        self.check_incarnation(message.bridge, now_s)
+        # Parts that are not on the road have no effect.
+        for part in message.parts:
+            if part.late_m < 0.0:
+                raise BadInputError("late_m", part.late_m, "at least 0")
 
     def _check_time(self, t_s: float, road_s: float) -> None:
         limit_s = road_s + self.tick_s

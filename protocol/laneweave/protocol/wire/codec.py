@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable
+from contextlib import suppress
 from functools import cache, lru_cache
 from types import NoneType, UnionType
 from typing import Any, get_args, get_origin, get_type_hints
@@ -161,10 +162,16 @@ def _refusal(payload: bytes, expected: type | None, problem: str) -> BadInputErr
         allowed = "a map of JSON values: text keys, finite 64-bit numbers, not too deep"
         return BadInputError("LogEvent.data", body[-1], allowed)
     match = _PLACE.fullmatch(problem)
-    if match is None:
-        return BadInputError("message", bytes(payload[:16]), "MessagePack of a message")
+    if match is not None:
+        # A damaged payload may mean something else to this decoder, for example repeated keys.
+        with suppress(Exception):
+            return _refusal_of_part(kind, body, match)
+    return BadInputError("message", bytes(payload[:16]), "MessagePack of a message")
+
+
+def _refusal_of_part(kind: type, body: object, match: re.Match[str]) -> BadInputError:
     field, value, hint = _part(kind, body, match["path"] or "")
-    lacking = _LENGTH.match(problem.removeprefix("Expected "))
+    lacking = _LENGTH.match(match.string.removeprefix("Expected "))
     if lacking is not None and isinstance(hint, type) and issubclass(hint, Struct):
         missing = _fields(hint)[int(lacking[1])].name
         return BadInputError(f"{field}.{missing}", NO_VALUE, "a value; this field is required")
@@ -175,18 +182,24 @@ def _refusal(payload: bytes, expected: type | None, problem: str) -> BadInputErr
 
 
 def _part(kind: type, body: object, path: str) -> tuple[str, Any, Any]:
-    """Return the name, value and type of the part of a message to which a decoder's path leads."""
+    """Return the name, value and type of the part of a message to which a decoder's path leads.
+
+    Raises:
+        TypeError, LookupError, StopIteration: the message has no such part.
+    """
     field, value, hint = kind.__name__, body, kind
     for step in re.findall(r"\[(\d+|\.\.\.)\]", path):
         hint = next((one for one in _options(hint) if one is not NoneType), hint)
         parts = get_args(hint)
         if step == "...":
-            assert isinstance(value, dict)  # noqa: S101 (the decoder has found a map)
+            if not isinstance(value, dict):
+                raise TypeError(value)
             key = next(key for key, item in value.items() if not _is_valid(item, parts[1]))
             field, value, hint = f"{field}[{key}]", value[key], parts[1]
             continue
         index = int(step)
-        assert isinstance(value, list)  # noqa: S101 (the decoder has found an array)
+        if not isinstance(value, list):
+            raise TypeError(value)
         if parts:
             hint, field = parts[0 if parts[-1] is Ellipsis else index], f"{field}[{index}]"
         else:

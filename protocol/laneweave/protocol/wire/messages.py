@@ -5,7 +5,7 @@ Messages are frozen msgspec structs, which travel as arrays of their fields in t
 receives a malformed message. New fields come last and have a default. `process_messages` has the
 messages about processes.
 `t_s` is road time [s], the clock that moves the lattice; it advances in ticks. A cell is (column,
-lane) in the lattice frame. The sections of docs/PROTOCOL.md on messages are generated from the
+lane) in the lattice frame. The sections of docs/MESSAGES.md are generated from the
 docstrings of both modules.
 """
 
@@ -44,8 +44,9 @@ class Ballot(NamedTuple):
 class Heartbeat(Message, frozen=True):
     """Coordinator to coordinators, bridge and observers, every `network.heartbeat_s` (wall clock).
 
-    Also sent at once when a coordinator begins or stops leading. Missing for `network.election_s`:
-    the sender no longer counts as a candidate. Late or duplicated: harmless. From a process whose
+    Also sent at once when a coordinator begins or stops leading. Missing for `network.election_s`,
+    or for 1.5 times the longest recent silence, at most twice as long: the sender no longer counts
+    as a candidate. Late or duplicated: harmless. From a process whose
     token has vanished, or that a newer process of the same name has replaced: only the term is
     used. A higher term than the receiver's, up to `bounds.max_election_term`: a candidate adopts
     it, a leader continues one term above it. With the receiver's own name: ignored.
@@ -157,7 +158,8 @@ class Plan(Message, frozen=True):
 
     ballot: Ballot
     blocks: tuple[Int64, ...]
-    """Blocks of the ballot, which contain the territory."""
+    """Blocks of the ballot, which contain the territory; in the rolling operation those in which
+    the members entered, whose states they read."""
     roster: tuple[Name, ...]
     """Vehicles of the ballot."""
     incarnations: dict[Name, Int64]

@@ -29,8 +29,8 @@ class Obstacle(Message, frozen=True):
     since_s: Real = 0.0
     """Road time at which the lane was closed."""
     until_s: Real | None = None
-    """Road time at which the cause ends; None: not known. Until no vehicle waits there any more, the
-    part stays closed."""
+    """Road time at which the cause ends; None: not known. The part stays closed until no vehicle
+    waits there any more."""
     vehicle: Name | None = None
     """The vehicle that has broken down, or that is passing."""
     speed_mps: Real = 0.0

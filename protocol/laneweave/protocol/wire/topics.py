@@ -11,7 +11,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping
 from enum import Enum, StrEnum
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from types import MappingProxyType
 
 from attrs import frozen
@@ -89,7 +89,7 @@ class Topic:
     pattern: str
     """Key without prefix or realm, with {parameters}."""
     kind: type[Message] | None
-    """Message class; None for tokens and the planning service."""
+    """Message class; None for tokens and queries."""
     sender: str
     """A `Party`, or `ANY_SENDER`. Keys with the name of a process are reserved for that process."""
     quality: Quality
@@ -118,6 +118,24 @@ class Topic:
     def parameters(self) -> tuple[str, ...]:
         """Names of the parameters, in order."""
         return tuple(re.findall(r"{(\w+)}", self.pattern))
+
+    @cached_property
+    def named_in_key(self) -> tuple[str, ...]:
+        """Names of the fields of its messages whose values are parameters of the key."""
+        known = () if self.kind is None else self.kind.__struct_fields__
+        return tuple(name for name in self.parameters if name in known)
+
+    def checked(self, message: object, parameters: Mapping[str, str]) -> object:
+        """Return a message that has the names in its key: a sender has rights for its own keys.
+
+        Raises:
+            BadInputError: it has another name.
+        """
+        for name in self.named_in_key:
+            value = getattr(message, name)
+            if str(value) != parameters[name]:
+                raise BadInputError(name, value, f"{parameters[name]}, as in its key")
+        return message
 
 
 CLOCK = Topic(

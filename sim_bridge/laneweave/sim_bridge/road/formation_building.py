@@ -19,8 +19,8 @@ must fit into those that remain.
 Vehicles from ramps join the formation whose columns pass, if it has room. It is closed when its
 columns have passed all entrances.
 
-For vehicles that waited at the end of a lane, columns are *reserved*: no vehicle enters them, in any
-lane. The vehicle that drives into them is a formation of its own.
+For vehicles that waited at the end of a lane, columns are *reserved*: no vehicle enters them, in
+any lane. The vehicle that drives into them is a formation of its own.
 """
 
 from __future__ import annotations

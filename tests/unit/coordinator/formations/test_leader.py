@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 import pytest
+from attrs import evolve
 
 from laneweave.coordinator.ballots.ballot_round import (
     FAILED,
@@ -17,6 +18,7 @@ from laneweave.coordinator.ballots.ballot_round import (
     BallotPhase,
 )
 from laneweave.coordinator.formations.leader import (
+    AWAITED_S,
     BACK_OFF_S,
     LEADER_RULES,
     LONGEST_RETRY_S,
@@ -26,6 +28,7 @@ from laneweave.coordinator.formations.leader import (
     FormationLeader,
 )
 from laneweave.coordinator.formations.roster import Formation
+from laneweave.protocol.scenario.formation_table import DrivingStructure
 from laneweave.protocol.state_machine import RuleBook
 from laneweave.protocol.wire.messages import Ballot, CensusEntry, Name, Plan, Prepare, VehicleState
 from support.rule_books import RuleRecorder
@@ -35,6 +38,7 @@ from support.states import holding as state
 A, B, C = Name("A"), Name("B"), Name("C")
 OTHERS = Ballot(1, Name("other"), 1, 1)
 RESEND_S = 0.2
+STRUCTURE = DrivingStructure(550.0, "parallel", (0, 1))
 RNG = random.Random(1)
 Reach = Callable[..., tuple[FormationLeader, Ballot]]
 
@@ -141,6 +145,30 @@ def test_l2_adopts_a_plan_that_all_have_accepted_and_sends_nothing() -> None:
     assert list(leader.outgoing(100.0)) == []
     assert not leader.take(PROMISED, 100.0)
     assert leader.wakeup_s is None
+
+
+@pytest.mark.parametrize(("structure", "adopts"), [(None, True), (STRUCTURE, False)])
+def test_l2_a_completed_plan_may_be_that_of_an_earlier_structure(
+    structure: DrivingStructure | None, adopts: bool
+) -> None:
+    def adopted_if(**shown: Any) -> bool:  # noqa: ANN401 (fields)
+        leader = control(A, B)
+        stage = evolve(leader.formation.stage, structure=structure)
+        leader.formation = evolve(leader.formation, stage=stage)
+        hear(leader, *(state(name, OTHERS, accepted=True, **shown) for name in (A, B)))
+        return phase(leader) is BallotPhase.IN_FORCE
+
+    assert adopted_if(done=True, go=True) is adopts
+    assert adopted_if()  # while it is executed
+
+
+def test_a_vehicle_is_missed_only_after_the_plan_was_sent() -> None:
+    """Planning may take longer than the time for an answer."""
+    leader, _ = planning(A, B)
+    leader.on_plan(plan_of(leader), 4.0)
+    assert leader.pop_awaited(4.0) == ()
+    assert leader.pop_awaited(4.0 + AWAITED_S) == (A, B)
+    assert leader.pop_awaited(4.1 + AWAITED_S) == ()
 
 
 @pytest.mark.parametrize(

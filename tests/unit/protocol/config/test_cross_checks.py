@@ -91,6 +91,8 @@ MISFITS: list[tuple[str, dict[str, Any]]] = [
         MTLS | {"security": {"mode": "mtls", "fleets": {"a": ["b"], "f": ["a"]}}},
     ),
     ("security.fleets[v0001]", MTLS | {"security": {"mode": "mtls", "fleets": {"v0001": "0/1"}}}),
+    ("demand.arrival_shares", MTLS | {"demand": {"arrival_shares": [0.5, 0.5]}}),
+    ("demand.arrival_shares", MTLS | {"demand": {"arrival_shares": [0.0, 0.0, 0.0]}}),
     ("security.folder", MTLS | {"security": {"mode": "mtls", "folder": ""}}),
     ("network.endpoint", MTLS | {"network": {"endpoint": "tls/[::1]:7447"}}),
     ("network.endpoint", MTLS | {"network": {"endpoint": "quic/[2001:db8::1]:7447"}}),

@@ -38,6 +38,7 @@ from laneweave.protocol.runtime.node import (
     Wakeup,
     Watch,
     Withdraw,
+    read_message,
     run_job,
 )
 from laneweave.protocol.runtime.transport import (
@@ -56,6 +57,7 @@ from laneweave.protocol.wire.codec import MAX_BYTES, decode, encode
 from laneweave.protocol.wire.messages import Heartbeat, Name, RoadClock
 from laneweave.protocol.wire.process_messages import LogEvent, Report
 from support.node_recorder import Recorder, at_start
+from support.wire_samples import different, filled
 
 KEYS = topics.Keys("r")
 BEAT = Heartbeat(Name("c1"), 7, 2, leading=True, plans=1)
@@ -214,6 +216,37 @@ def test_a_message_on_a_topic_without_messages_is_counted(bench: Bench, key: str
 
 
 # --- what goes out ----------------------------------------------------------------------------
+
+
+FORGED = [
+    (topic, name)
+    for topic in topics.TOPICS
+    if topic.kind is not None
+    for name in topic.named_in_key
+]
+"""Topics, and parameters of their keys that their messages contain."""
+
+
+@pytest.mark.parametrize(("topic", "name"), FORGED, ids=lambda one: getattr(one, "name", one))
+def test_a_message_has_the_names_in_its_key(topic: topics.Topic, name: str) -> None:
+    """A router grants the rights of a sender for its keys."""
+    assert topic.kind is not None
+    message: Any = filled(topic.kind, different())
+    known = dict.fromkeys(topic.parameters, "p")
+    known |= {one: str(getattr(message, one)) for one in topic.named_in_key}
+    keys = topics.Keys("here")
+    arrived = read_message(keys, keys.key(topic, **known), encode(message))
+    assert (arrived.message, arrived.parameters) == (message, known)
+    other = keys.key(topic, **(known | {name: "7"}))
+    with pytest.raises(BadInputError, match="7, as in its key"):
+        read_message(keys, other, encode(message))
+
+
+def test_vehicles_and_coordinators_speak_for_themselves_only() -> None:
+    assert {(topic.name, name) for topic, name in FORGED} >= {
+        ("state", "vehicle"), ("command", "vehicle"), ("motion", "vehicle"),
+        ("heartbeat", "coordinator"), ("event", "name"), ("settings", "name"), ("report", "name"),
+    }  # fmt: skip
 
 
 def test_effects_reach_the_transport(bench: Bench) -> None:

@@ -64,8 +64,8 @@ FLOW = beat_key("flow")
 SETTLED = token_key("settled")
 
 
-def beat(number: int = 0) -> bytes:
-    return encode(Heartbeat(Name("c"), 1, number, leading=False, plans=0))
+def beat(name: str, number: int = 0) -> bytes:
+    return encode(Heartbeat(Name(name), 1, number, leading=False, plans=0))
 
 
 @define
@@ -338,7 +338,7 @@ def flow(bed: Bed, sender: Party, receiver: Party) -> None:
     count = len(receiver.all_received())
 
     def arrives() -> bool:
-        sender.transport.publish(FLOW, beat(), Quality.ASSURED)
+        sender.transport.publish(FLOW, beat("flow"), Quality.ASSURED)
         bed.quiet()
         return len(receiver.all_received()) > count
 
@@ -366,10 +366,10 @@ def test_what_is_published_reaches_subscribers(bed: Bed, quality: Quality) -> No
         party.transport.subscribe(BEATS)
         flow(bed, a, party)
     for party, name in ((a, "x"), (c, "y")):  # own messages come back
-        party.transport.publish(beat_key(name), beat(7), quality)
+        party.transport.publish(beat_key(name), beat(name, 7), quality)
         bed.until(lambda: b.received() and c.received())
         bed.quiet()
-        assert b.received() == c.received() == [Received(beat_key(name), beat(7))]
+        assert b.received() == c.received() == [Received(beat_key(name), beat(name, 7))]
         b.got.clear()
         c.got.clear()
     assert a.received() == []
@@ -385,7 +385,7 @@ def test_an_expression_selects_keys(bed: Bed) -> None:
     for party in (one, deep, exact):
         flow(bed, a, party)
     for name in ("x", "y"):
-        a.transport.publish(beat_key(name), beat(), Quality.ASSURED)
+        a.transport.publish(beat_key(name), beat(name), Quality.ASSURED)
     bed.until(lambda: len(one.received()) == len(deep.received()) == 2 and exact.received())
     bed.quiet()
     assert {item.key for item in one.received()} == {beat_key("x"), beat_key("y")}
@@ -403,7 +403,7 @@ def test_nothing_comes_after_unsubscribe(bed: Bed) -> None:
     b.transport.unsubscribe(BEATS)
     b.transport.unsubscribe(TOKENS)
     bed.quiet()
-    a.transport.publish(beat_key("a"), beat(), Quality.ASSURED)
+    a.transport.publish(beat_key("a"), beat("a"), Quality.ASSURED)
     bed.until(c.received)
     bed.quiet()
     assert b.received() == []
@@ -617,7 +617,7 @@ def test_after_close_everything_is_harmless(bed: Bed) -> None:
         a.transport.close()
     bed.until(lambda: b.tokens() == ["+a", "-a"])
     for _ in range(2):
-        a.transport.publish(beat_key("a"), beat(), Quality.ASSURED)
+        a.transport.publish(beat_key("a"), beat("a"), Quality.ASSURED)
         a.transport.unsubscribe(BEATS)
         a.transport.subscribe(BEATS)
         a.transport.withdraw(token_key("a"))
@@ -628,7 +628,7 @@ def test_after_close_everything_is_harmless(bed: Bed) -> None:
         a.transport.answer(1, b"", ok=True)
         a.transport.close()
     a.got.clear()
-    b.transport.publish(beat_key("b"), beat(), Quality.ASSURED)
+    b.transport.publish(beat_key("b"), beat("b"), Quality.ASSURED)
     bed.until(b.received)
     bed.quiet()
     assert a.got == []
@@ -653,7 +653,7 @@ def test_without_the_link_all_tokens_vanish_and_come_back(breakable_bed: Bed) ->
     assert sorted(b.tokens()) == ["-a", "-b"]
     assert LinkUp() not in b.got
     # No call raises meanwhile.
-    a.transport.publish(beat_key("a"), beat(1), Quality.ASSURED)
+    a.transport.publish(beat_key("a"), beat("a", 1), Quality.ASSURED)
     a.transport.announce(token_key("meanwhile"))
     b.got.clear()
     bed.mend_link(a, b)
@@ -767,7 +767,7 @@ class Errand:
                 self.wakeup_s = now_s + 0.05
             case node.Wakeup():
                 self.wakeup_s = None
-                message = Heartbeat(Name("c"), 1, 1, leading=False, plans=0)
+                message = Heartbeat(Name("errand"), 1, 1, leading=False, plans=0)
                 yield node.Send(HEARTBEAT, message, {"coordinator": "errand"})
                 yield node.Compute(1, lambda _: "done")
             case node.Computed(1, "done"):

@@ -18,8 +18,16 @@ from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.names import NAME_PATTERN
 from laneweave.protocol.wire import messages, obstacle_messages, process_messages
 from laneweave.protocol.wire.codec import KINDS, MAX_BYTES, VERSION, decode, encode
-from laneweave.protocol.wire.messages import Ballot, Heartbeat, Name, Plan, RoadClock, Sense
-from laneweave.protocol.wire.process_messages import Report
+from laneweave.protocol.wire.messages import (
+    Ballot,
+    Heartbeat,
+    Name,
+    Plan,
+    RoadClock,
+    Sense,
+    VehicleState,
+)
+from laneweave.protocol.wire.process_messages import ProcessSettings, Report
 from support.examples import examples
 from support.refusals import refusal
 from support.tables import for_each
@@ -431,6 +439,35 @@ def test_every_truncation_and_every_addition_is_refused(sample: object) -> None:
     payload = encode(sample)
     for wrong in (payload + b"\0", *(payload[:length] for length in range(len(payload)))):
         assert refusal(decode, wrong).field == "message"
+
+
+def test_a_repeated_key_is_refused() -> None:
+    """The first value is wrong, and other decoders see only the second one."""
+    settings = ProcessSettings(Name("agent"), Name("v1"), 1, {"MARK": "y"})
+    pairs = b"".join(map(msgpack.packb, ("x", 1, "x", "y")))
+    payload = encode(settings).replace(msgpack.packb({"MARK": "y"}), b"\x82" + pairs)
+    with pytest.raises(BadInputError):
+        decode(payload, ProcessSettings)
+
+
+def test_an_extension_in_a_message_with_fields_of_a_later_release_is_refused() -> None:
+    """A decoder that skips the further fields makes an array of the extension."""
+    state = encode(SAMPLES[VehicleState])
+    version, name, body = msgpack.unpackb(state, strict_map_key=False)
+    for number in range(len(body)):
+        for extension in (msgpack.ExtType(5, b"abc"), msgpack.Timestamp(1)):
+            changed = [*body, "later"]
+            changed[number] = extension
+            with pytest.raises(BadInputError):
+                decode(msgpack.packb([version, name, changed]), VehicleState)
+    census = (
+        b"\x93\x03\xa6Census\x97\xcb?\xf0\x00\x00\x00\x00\x00\x00\x91\x99\xa1v\x92\x00\x00"
+        b"\x01\xcb\x00\x00\x00\x00\x00\x00\x00\x00\x93\x01\xcb@\x00\x00\x00\x00\x00\x00\x00"
+        b"\xc0\xa3end\xa3car\xcb\x00\x00\x00\x00\x00\x00\x00\x00\x90\xc7\x03\x05abc\x91\x93"
+        b"\x01\x02\xcb@\x08\x00\x00\x00\x00\x00\x00\xff\x00\x90"
+    )
+    with pytest.raises(BadInputError):
+        decode(census.replace(b"\x93\x03\xa6", b"\x93" + msgpack.packb(VERSION) + b"\xa6"))
 
 
 def test_random_bytes_and_bodies_are_refused() -> None:

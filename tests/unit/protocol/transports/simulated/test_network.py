@@ -184,10 +184,10 @@ def test_realms_in_one_network_do_not_mix() -> None:
     network.add("a", ours, "r")
     network.add("b", theirs, "s")
     network.run(0.1)
-    network.inject("laneweave/r/heartbeat/x", BEAT)
+    network.inject("laneweave/r/heartbeat/a", BEAT)
     network.run(0.2)
     assert (ours.numbers, theirs.numbers) == ([4], [])
-    network.inject("laneweave/s/heartbeat/x", BEAT)
+    network.inject("laneweave/s/heartbeat/a", BEAT)
     network.run(0.3)
     assert (ours.numbers, theirs.numbers) == ([4], [4])
     assert network.node("a").rejected == network.node("b").rejected == 0
