@@ -49,8 +49,8 @@ from laneweave.protocol.wire.topics import (
 NO_BRIDGE_S = 60.0
 """Time without a bridge after which a process for named vehicles exits (node clock)."""
 RETURN_S = 1.0
-"""Time after which the census, and until which a SENSE, shows that a vehicle has not left although
-its agent was told so (node clock)."""
+"""Time within which a SENSE shows that a vehicle has not left, although a SENSE has reported that
+it has (node clock). After this time, the census decides."""
 
 
 @frozen
@@ -103,7 +103,7 @@ class AgentHost:
         self._no_bridge_since_s: float | None = 0.0
         """Time at which the bridge was lost; None: a bridge is up."""
         self._left: dict[Name, tuple[float, int]] = {}
-        """When agents were told that their vehicles have left (node clock), and in which tick."""
+        """When it was reported that vehicles have left (node clock), and in which tick."""
         self._obstacles: Obstacles | None = None
         self._solves = self._unusable = 0
         """Counters of agents that have been removed."""
@@ -285,7 +285,7 @@ class AgentHost:
         return effects
 
     def _start(self, name: Name) -> Effect:
-        """Start the agent of a vehicle, perhaps of one that had not left although it was told."""
+        """Start the agent of a vehicle, perhaps of one that was reported to have left."""
         self._left.pop(name, None)
         self._agents[name] = self._make_agent(name)
         if self._obstacles is not None:
@@ -322,7 +322,7 @@ class AgentHost:
             # The vehicle has left, and the SENSE that reports it was lost.
             effects += self._remove(name)
         self._seen = set(listed)
-        self._left = {name: told for name, told in self._left.items() if name in listed}
+        self._left = {name: when for name, when in self._left.items() if name in listed}
         return effects
 
     def _update_subscriptions(self, effects: list[Effect]) -> None:

@@ -119,7 +119,7 @@ class QuadraticProgram:
             raise ValueError(f"cost has shape {cost.shape}, but there are {n} unknowns")
         self._settings = settings or QPSettings()
         self._scale = _checked_scale(scale or QPScale(np.ones(m), np.ones(n)), m, n)
-        self._least_scale = float(self._scale.constraints.min(initial=1.0))
+        self._min_scale = float(self._scale.constraints.min(initial=1.0))
         by_constraints = sparse.diags(self._scale.constraints)
         by_unknowns = sparse.diags(self._scale.unknowns)
         cost_csc = (by_unknowns @ cost @ by_unknowns).tocsc()
@@ -218,7 +218,7 @@ class QuadraticProgram:
         violation = math.inf
         if status == SOLVED:
             # A bound: OSQP measures the violation where it terminates.
-            violation = float(solver.info.prim_res) / self._least_scale
+            violation = float(solver.info.prim_res) / self._min_scale
         if not violation <= self._settings.tolerance and status in _WITH_SOLUTION:
             violation = self._violation(scaled)
         usable = violation <= self._settings.tolerance

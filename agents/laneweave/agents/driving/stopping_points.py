@@ -43,7 +43,7 @@ _REACT_S = 0.3
 """Time allowed to restore that distance."""
 _NEAR_M = 2.0
 """Distance to its bound from which a vehicle ahead is ignored."""
-_LEAST_M = 1e-3
+_MIN_FREE_M = 1e-3
 """Shortest distance in which a vehicle is asked to stop."""
 _KEPT_LATER = math.exp(-1.0)
 """Share of its acceleration that a vehicle ahead keeps after `SENSED_S`."""
@@ -120,7 +120,7 @@ class StoppingPoints:
         free_m = bounds[first:known] - s
         room = half * half + (2.0 / brake) * (free_m - v * half)
         w = brake * (np.sqrt(np.maximum(room, 0.0)) - half)
-        standing = v * v / (2.0 * np.maximum(free_m, _LEAST_M))
+        standing = v * v / (2.0 * np.maximum(free_m, _MIN_FREE_M))
         return float(np.where(w >= 0.0, (v - w) / t, standing).max())
 
     def _is_far(self, commanded: State, s_m: float, other: Neighbour) -> bool:

@@ -28,7 +28,7 @@ from laneweave.protocol.wire.messages import (
 
 @frozen
 class Territory:
-    """What plans may use. Each rule is that of the operation that needs it; here it has no effect.
+    """What plans may use. The default rules allow everything; operations override those they need.
 
     A vehicle has a record, of joined blocks or of owned cells.
     """
@@ -36,7 +36,7 @@ class Territory:
     stores_promises: ClassVar[bool] = False
     """Whether motion controllers store promises, which then bind later processes in charge."""
     given_up_cells_stay_free: ClassVar[bool] = False
-    """Whether no vehicle is led into cells that a vehicle gives up; others of its formation are."""
+    """Whether cells that a vehicle gives up stay free; otherwise others of its formation use them."""
 
     def is_addressed(self, _record: VehicleRecord, _prepare: Prepare) -> bool:
         """Return whether a PREPARE whose roster contains the vehicle is for it."""
@@ -71,7 +71,7 @@ class Territory:
         return True
 
     def owned_among(self, _cells: Iterable[Cell]) -> Iterable[Cell]:
-        """Return those of the cells kept free for a vehicle that it then owns."""
+        """Return which of the cells reserved for a vehicle it owns once it enters again."""
         return ()
 
     def transfer_of_departed(self, record: VehicleRecord) -> PendingTransfer | None:

@@ -114,11 +114,11 @@ def _elements(file: Path, tag: str) -> Iterator[ET.Element]:
 
 def _conflict(element: ET.Element) -> Conflict | None:
     """Return a conflict in the output of SUMO's device; None: the two were never in conflict."""
-    least = element.find("minTTC")
-    if least is None or least.get("value", "NA") == "NA":
+    lowest = element.find("minTTC")
+    if lowest is None or lowest.get("value", "NA") == "NA":
         return None
     vehicles = tuple(sorted((element.get("ego", ""), element.get("foe", ""))))
-    return Conflict(vehicles, float(least.get("time", "nan")), float(least.get("value", "nan")))
+    return Conflict(vehicles, float(lowest.get("time", "nan")), float(lowest.get("value", "nan")))
 
 
 def _trip(element: ET.Element) -> SumoTrip:

@@ -163,7 +163,7 @@ class Roadside:
         self.obstacles = Obstacles(scenario, breakdowns)
         self._lane_ends = LaneEndControl(scenario, self._meter, self.obstacles)
         self._temporary = NO_PARTS
-        self._told: tuple[Obstacle, ...] = ()
+        self._reported: tuple[Obstacle, ...] = ()
         """Obstacles of which events have been logged."""
         self.lane_ends = LaneEnds(scenario)
         """Ends of lanes now, which motion controllers know."""
@@ -232,10 +232,10 @@ class Roadside:
     def pop_obstacle_changes(self) -> Iterator[tuple[str, Obstacle]]:
         """Yield what has changed since the last call: kinds of events, and obstacles."""
         yield from self.obstacles.passing.pop_changes()
-        before, self._told = self._told, self.obstacles.at_rest
-        if self._told != before:
-            yield from ((PART_CLOSED, one) for one in self._told if one not in before)
-            now = {(one.lane, one.from_m) for one in self._told}
+        before, self._reported = self._reported, self.obstacles.at_rest
+        if self._reported != before:
+            yield from ((PART_CLOSED, one) for one in self._reported if one not in before)
+            now = {(one.lane, one.from_m) for one in self._reported}
             gone = (one for one in before if (one.lane, one.from_m) not in now)
             yield from ((PART_OPENED, one) for one in gone)
 
