@@ -36,7 +36,7 @@ class Territory:
     stores_promises: ClassVar[bool] = False
     """Whether motion controllers store promises, which then bind later processes in charge."""
     given_up_cells_stay_free: ClassVar[bool] = False
-    """Whether cells that a vehicle gives up stay free; otherwise others of its formation use them."""
+    """Whether cells that a vehicle gives up stay free: no other member may use them."""
 
     def is_addressed(self, _record: VehicleRecord, _prepare: Prepare) -> bool:
         """Return whether a PREPARE whose roster contains the vehicle is for it."""
