@@ -32,7 +32,8 @@ from laneweave.protocol.wire.messages import Plan
 RESERVE_S = 3.0
 """Spare road time after the last slot, for lost messages."""
 MIN_RESERVE_S = 1.0
-"""Spare time if `RESERVE_S` would leave too little for comfortable moves."""
+"""Spare time if `RESERVE_S` would leave too little for comfortable moves; none if this would leave
+too little for gentle ones (decision 76)."""
 DELAY_S = 0.5
 """Step between the later starts of a plan that are tried if conflicts remain in spite of pauses."""
 
@@ -104,10 +105,14 @@ def paced(
             for step, *cells in moves
         )
 
-    # Prefer a smaller reserve to shorter slots.
+    gentle = [slot_s for slot_s in slots_s if slot_s >= timing.gentle_cycle_s]
+    without_reserve = [(slot_s, 0.0) for slot_s in gentle] if len(slots_s) > 1 else []
+    # Prefer a smaller reserve to shorter slots, and none at all to slots without gentle moves.
     for slot_s, reserve_s in (
         *((slot_s, RESERVE_S) for slot_s in comfortable),
-        *((slot_s, MIN_RESERVE_S) for slot_s in slots_s),
+        *((slot_s, MIN_RESERVE_S) for slot_s in gentle),
+        *without_reserve,
+        *((slot_s, MIN_RESERVE_S) for slot_s in slots_s[len(gentle) :]),
         (slots_s[-1], 0.0),
     ):
         t0_s = plan.t0_s
@@ -116,6 +121,8 @@ def paced(
         last = replace(plan, t0_s=t0_s, slot_s=slot_s)
         if slot_s < min_slot_s() or not in_time(last, reserve_s):
             continue
+        if conflicting and (slot_s, reserve_s) in without_reserve:
+            continue  # keep the reserve, and the shortest conflict
         paused = neighbours.with_pauses(last, partial(in_time, reserve_s=reserve_s))
         for one in (paused, *_later(last, scenario)):
             if not in_time(one, reserve_s):
@@ -123,7 +130,8 @@ def paced(
             conflict_s = max(neighbours.conflicts_s(one).values(), default=0.0)
             if not conflict_s:
                 return one
-            conflicting.append((conflict_s, one))
+            if (slot_s, reserve_s) not in without_reserve:
+                conflicting.append((conflict_s, one))
     return min(conflicting, key=itemgetter(0))[1] if conflicting else last
 
 

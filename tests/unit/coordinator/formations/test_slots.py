@@ -45,15 +45,20 @@ def test_slots_are_the_longest_that_leave_a_reserve(steps: int, late_s: float) -
     plan = replace(plan, t0_s=plan.t0_s + late_s)
     chosen = paced(plan)
     assert chosen == replace(plan, slot_s=chosen.slot_s)
-    leisurely, hasty = (
+    timing = SCENARIO.timing
+    leisurely, hasty, without = (
         max(
-            (s for s in SCENARIO.timing.slots_s if steps * s <= left_s(plan) - reserve_s),
-            default=SCENARIO.timing.slots_s[0],
+            (s for s in timing.slots_s if steps * s <= left_s(plan) - reserve_s),
+            default=timing.slots_s[0],
         )
-        for reserve_s in (RESERVE_S, MIN_RESERVE_S)
+        for reserve_s in (RESERVE_S, MIN_RESERVE_S, 0.0)
     )
-    comfortable = leisurely >= SCENARIO.timing.comfortable_cycle_s
-    assert chosen.slot_s == pytest.approx(leisurely if comfortable else hasty)
+    expected = leisurely
+    if leisurely < timing.comfortable_cycle_s:
+        # The reserve is given up only for gentle moves, and then only what they need of it.
+        use_all = hasty < timing.gentle_cycle_s <= without
+        expected = without if use_all else hasty
+    assert chosen.slot_s == pytest.approx(expected)
 
 
 def test_more_steps_have_shorter_slots() -> None:
