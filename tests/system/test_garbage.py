@@ -17,6 +17,7 @@ from msgspec.structs import replace
 from laneweave.protocol.security.connection import Access
 from laneweave.protocol.transports.zenoh.transport import ZenohTransport
 from laneweave.protocol.wire.codec import KINDS, MAX_BYTES, VERSION, encode
+from laneweave.protocol.wire.field_types import Message
 from laneweave.protocol.wire.messages import Census, Heartbeat, Name, RoadClock
 from laneweave.protocol.wire.process_messages import LogEvent, Report
 from laneweave.protocol.wire.topics import (
@@ -69,11 +70,24 @@ def messages(vehicle: Name, *, number: int, real: float) -> dict[type, Any]:
     return made | {kind: replace(made[kind], **special[kind]) for kind in special}
 
 
+def parameters_of(vehicle: str) -> dict[str, Any]:
+    """Return parameters of keys, of a vehicle and of processes that are there."""
+    return {
+        "process": vehicle, "vehicle": vehicle, "block": 0, "stretch": 0, "coordinator": "c1",
+        "role": "agent", "name": vehicle, "incarnation": 1,
+        "session": "s1", "client": "client", "drives": "0-of-1", "digests": "0-0-0-0",
+    }  # fmt: skip
+
+
+def own_key(topic: Topic, message: Message, vehicle: str) -> str:
+    """Return the key that has the names in a message; on others it is refused."""
+    own = {name: getattr(message, name) for name in topic.named_in_key}
+    return KEYS.key(topic, **(parameters_of(vehicle) | own))
+
+
 def keys_of(topic: Topic, vehicle: str) -> Iterator[str]:
-    """Return keys of a topic: of somebody who is there and of somebody who is not."""
-    there = {"process": vehicle, "vehicle": vehicle, "block": 0, "stretch": 0, "coordinator": "c1"}
-    there |= {"role": "agent", "name": vehicle, "incarnation": 1}
-    there |= {"session": "s1", "client": "client", "drives": "0-of-1", "digests": "0-0-0-0"}
+    """Return keys of a topic: of processes that are there and of others that are not."""
+    there = parameters_of(vehicle)
     nobody = dict.fromkeys(topic.parameters, "ghost") | {"block": 99, "stretch": 99}
     yield KEYS.key(topic, **there)
     yield KEYS.key(topic, **nobody)
@@ -149,8 +163,9 @@ def say_nonsense(transport: ZenohTransport) -> None:
             if topic.kind in (Heartbeat, RoadClock, Census):
                 forged = harmless
             if topic.kind is not None:
-                for key in keys_of(topic, "v0001"):
-                    transport.publish(key, encode(forged[topic.kind]), Quality.ASSURED)
+                message = forged[topic.kind]
+                for key in (*keys_of(topic, "v0001"), own_key(topic, message, "v0001")):
+                    transport.publish(key, encode(message), Quality.ASSURED)
     transport.publish("laneweave/default/nothing", b"", Quality.ASSURED)
     transport.publish("laneweave/default/sense/v0001/v0001/more", b"", Quality.ASSURED)
     transport.publish("laneweave/default/command/" + "v" * 1000, b"", Quality.ASSURED)
@@ -234,13 +249,15 @@ def test_forged_messages_crash_no_process(
             forged = messages(vehicle, number=number, real=real)
             for topic in TOPICS:
                 if topic.kind is not None:
-                    for key in keys_of(topic, vehicle):
-                        transport.publish(key, encode(forged[topic.kind]), Quality.ASSURED)
+                    message = forged[topic.kind]
+                    for key in (*keys_of(topic, vehicle), own_key(topic, message, vehicle)):
+                        transport.publish(key, encode(message), Quality.ASSURED)
 
     def recorded() -> bool:
         """Return whether the bridge has recorded three rounds, so that others received them, too.
 
-        In a round there is one event for each vehicle, forgery, and key of two.
+        In a round there is one event for each vehicle, forgery, and key with its names, of which
+        there are two: one of the vehicle, and the message's own, which is the same.
         """
         forged = [event for event in events(folder, "plan-made") if event["role"] == "agent"]
         return len(forged) >= 3 * 2 * len(known) * len(FORGED)
