@@ -112,7 +112,7 @@ def test_the_others_pass_a_slow_vehicle(tmp_path: Path, from_m: float, speed_mps
 @pytest.mark.parametrize(
     ("operation", "loss"),
     variants(
-        [("formations", 0.0), ("rolling", 0.0), ("formations", 0.3), ("rolling", 0.3)], count=1
+        [("rolling", 0.0), ("formations", 0.0), ("rolling", 0.3), ("formations", 0.3)], count=1
     ),
 )
 def test_the_lane_is_cleared_before_a_fast_vehicle(

@@ -49,8 +49,8 @@ from laneweave.protocol.wire.topics import (
 NO_BRIDGE_S = 60.0
 """Time without a bridge after which a process for named vehicles exits (node clock)."""
 RETURN_S = 1.0
-"""Time within which a SENSE shows that a vehicle has not left, although a SENSE has reported that
-it has (node clock). After this time, the census decides."""
+"""Time after a SENSE that reports that a vehicle has left (node clock). Within it, a newer SENSE
+shows that the vehicle is still there; later, a census does."""
 
 
 @frozen

@@ -1,4 +1,4 @@
-"""Cells that vehicles entered, and hold cells in which they can be since."""
+"""Check that hold cells are within reach of the cells in which vehicles entered."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.wire.messages import CensusEntry, Name, VehicleState
 
 SPARE_COLUMNS = 100
-"""Columns by which a vehicle may be farther from the one that it entered than it gains on others
-at its maximum speed."""
+"""Margin, added to the number of columns that a vehicle at its maximum speed gains on the
+lattice."""
 
 
 class EntryCells:

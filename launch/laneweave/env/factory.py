@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final, Literal, get_args
 
+import numpy as np
+
 from laneweave.env.rewards import Rewards
 from laneweave.env.slots_env import SlotsEnv
 from laneweave.env.vehicles_env import VehiclesEnv
@@ -50,13 +52,13 @@ def parallel_env(
     Raises:
         BadInputError: the scenario or a value is invalid; the scenario has a SUMO simulation.
     """
-    if type(columns) is not int or not 1 <= columns <= MAX_COLUMNS:
+    if not _is_integer(columns) or not 1 <= columns <= MAX_COLUMNS:
         raise BadInputError("columns", columns, f"an integer from 1 to {MAX_COLUMNS}")
     if agents not in get_args(Agents):
         raise unknown_name("agents", agents, get_args(Agents))
     if slots is not None and agents != "slots":
         raise BadInputError("slots", slots, 'None, unless agents="slots"')
-    if slots is not None and not (type(slots) is int and 1 <= slots <= MAX_SLOTS):
+    if slots is not None and not (_is_integer(slots) and 1 <= slots <= MAX_SLOTS):
         raise BadInputError("slots", slots, f"an integer from 1 to {MAX_SLOTS}, or None")
     modes = VehiclesEnv.metadata["render_modes"]
     if render_mode is not None and render_mode not in modes:
@@ -76,3 +78,7 @@ def parallel_env(
     if agents == "slots":
         return SlotsEnv(settings, rewards or Rewards(), columns, slots=slots, **given)
     return VehiclesEnv(settings, rewards or Rewards(), columns, **given)
+
+
+def _is_integer(value: object) -> bool:
+    return isinstance(value, int | np.integer) and not isinstance(value, bool)

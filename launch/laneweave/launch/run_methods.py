@@ -206,14 +206,17 @@ _OF_METHODS = (RULE, LC2013)
 _OF_FORMATION_CONTROL = ("formation", "sensing", "braking", "tracking", "network", "radio")
 """Tables of a scenario that built-in reference methods do not read, except `_READ_BY_ALL`."""
 _READ_BY_ALL = "formation.speed_mps"
-_WITHOUT_EFFECT = ("security", "service", "observation")
-"""Tables of a scenario that do not affect the results of runs."""
+_WITHOUT_EFFECT = (
+    "security", "service", "observation",
+    "network.endpoint", "network.listen", "network.realm", "runtime.max_pace", "sumo.gui",
+)  # fmt: skip
+"""Tables and fields of a scenario that do not affect the results of runs."""
 
 
 def affects(field_name: str, method: str) -> bool:
     """Return whether a field (`table.field`) of a scenario can change the results of a method."""
     table = field_name.partition(".")[0]
-    if table in _WITHOUT_EFFECT:
+    if table in _WITHOUT_EFFECT or field_name in _WITHOUT_EFFECT:
         return False
     if method == FORMATION:
         return table not in _OF_METHODS

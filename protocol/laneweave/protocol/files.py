@@ -31,7 +31,7 @@ def write_atomically(path: Path, write: str | Callable[[Path], object]) -> None:
         part.replace(path)
     except BaseException as error:
         part.unlink(missing_ok=True)
-        if isinstance(error, OSError):
+        if isinstance(error, OSError) and error.errno and error.filename in (None, str(part)):
             error.filename = str(path)
         raise
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import errno
 import signal
 from pathlib import Path
 from resource import RLIM_INFINITY, RLIMIT_FSIZE, setrlimit
+from unittest.mock import Mock
 
 import pytest
 
@@ -47,11 +49,25 @@ def test_what_ends_writing_leaves_the_file_as_it_was(
         part.write_text("half", encoding="utf-8")
         raise error
 
-    with pytest.raises(error) as failed:
+    with pytest.raises(error):
         write_atomically(path, fail)
-    assert getattr(failed.value, "filename", str(path)) == str(path)
     assert [*tmp_path.iterdir()] == [path]
     assert path.read_text(encoding="utf-8") == "first"
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (OSError(errno.ENOSPC, "full"), "[Errno 28] full: '{path}'"),
+        (OSError("encoder error -2"), "encoder error -2"),
+        (FileNotFoundError(errno.ENOENT, "gone", "input.txt"), "[Errno 2] gone: 'input.txt'"),
+    ],
+)
+def test_errors_of_the_disk_name_the_file(tmp_path: Path, error: OSError, said: str) -> None:
+    path = tmp_path / "file.txt"
+    with pytest.raises(OSError, match=".") as failed:
+        write_atomically(path, Mock(side_effect=error))
+    assert str(failed.value) == said.format(path=path)
 
 
 def test_files_that_differ_in_their_suffix_are_written_at_once(tmp_path: Path) -> None:

@@ -168,13 +168,8 @@ def all_have_reported(leader: FormationLeader, _: object) -> bool:
 
 
 def one_plan_is_in_force(leader: FormationLeader, _: object) -> bool:
-    """All members have accepted the same ballot, and none is overdue.
-
-    A completed plan may be that of an earlier stage. For sorting, L8 finds out; not for structures.
-    """
+    """All members have accepted the same ballot, and none is overdue."""
     states = [leader.states[name] for name in leader.roster]
-    if leader.formation.stage.structure is not None and all(state.done for state in states):
-        return False
     return len({state.record.promised for state in states}) == 1 and all(
         state.accepted and not state.overdue for state in states
     )

@@ -106,7 +106,8 @@ def paced(
         )
 
     gentle = [slot_s for slot_s in slots_s if slot_s >= timing.gentle_cycle_s]
-    without_reserve = [(slot_s, 0.0) for slot_s in gentle] if len(slots_s) > 1 else []
+    # The shortest ones first, which leave most of the reserve.
+    without_reserve = [(slot_s, 0.0) for slot_s in gentle[::-1] if slot_s != slots_s[-1]]
     # Prefer a smaller reserve to shorter slots, and none at all to slots without gentle moves.
     for slot_s, reserve_s in (
         *((slot_s, RESERVE_S) for slot_s in comfortable),

@@ -25,6 +25,8 @@ SWEEP_FILE, POINT_FILE = "sweep.json", "point.json"
 POINT_SCHEMA = "laneweave.sweep.point/1"
 VARIED = ("demand.volume_veh_per_lane_h", "seed")
 """Fields of a scenario in which runs of a label may differ."""
+_OF_DEMAND = ("demand.", "entrance", "exit", "vehicle_type")
+"""Fields of a scenario that follow from the demand of a SUMO simulation."""
 
 
 @frozen
@@ -98,14 +100,17 @@ class Comparison:
         """Sort runs; a folder that is named twice is one run.
 
         Runs of a label that differ in more than volume and seed, or have other faults, are not
-        averaged: they get other labels, which contain their folder or that of their sweep.
+        averaged: they get other labels, which contain their folder or that of their sweep. So do
+        repetitions of a volume and seed.
         """
         all_runs = list({(run.folder.resolve(), run.order): run for run in runs}.values())
         listed = all_runs
         for name in (_last_part, str):
-            alike = _labels_of_like_runs(listed)
+            alike, counts = _labels_of_like_runs(listed), Counter(run.order for run in listed)
             listed = [
-                run if run.label in alike else _labelled_by_folder(original, name)
+                run
+                if run.label in alike and counts[run.order] == 1
+                else _labelled_by_folder(original, name)
                 for run, original in zip(listed, all_runs, strict=True)
             ]
         listed.sort(key=lambda run: run.order)
@@ -161,17 +166,17 @@ def settings_of(scenario: Scenario, method: str, ignored: Collection[str] = ()) 
 
 
 def _labels_of_like_runs(runs: Iterable[Run]) -> set[str]:
-    """Return the labels whose runs differ in volume or seed, and in nothing else."""
-    counts = Counter(run.order for run in runs)
+    """Return the labels whose runs differ in nothing but volume and seed."""
     kinds: dict[str, set[str]] = {}
     for run in runs:
         own = settings_of(run.scenario, run.method, VARIED)
+        if run.scenario.sumo.config:  # SUMO draws the demand from the seed
+            own = {name: one for name, one in own.items() if not name.startswith(_OF_DEMAND)}
         faults = None if run.summary is None else run.summary.faults
         if faults is not None:
             own["faults"] = sorted({one["fault"] for one in faults["injected"]})
         kinds.setdefault(run.label, set()).add(repr(own))
-    repeated = {run.label for run in runs if counts[run.order] > 1}
-    return {label for label, found in kinds.items() if len(found) == 1} - repeated
+    return {label for label, found in kinds.items() if len(found) == 1}
 
 
 def _labelled_by_folder(run: Run, name: Callable[[Path], str]) -> Run:

@@ -49,8 +49,8 @@ AHEAD_NS = 2 * DAY_NS
 accept what the bridge has accepted."""
 SUCCESSION_NS = 10**9
 """Maximum lead of a claim over the process in charge, if the latter is itself near the limit."""
-MAX_MOTION_S = 600.0
-"""Maximum time until a motion ends; the longest slots last a minute."""
+MAX_MOTION_TICKS = 6000
+"""Maximum duration of a motion; the longest are those of vehicles that settle in their cells."""
 MAX_MESSAGES_PER_S = 100_000
 """Maximum mean rate of the messages that a process publishes or receives: a process needs about
 10 us to encode or decode one."""
@@ -130,7 +130,7 @@ class Bounds:
                 self._check_record(message.record, road_s, now_s)
             case Sense():
                 self._check_tick(message.tick, message.t_s, road_s)
-                limit = message.tick + round(MAX_MOTION_S / self.tick_s)
+                limit = message.tick + MAX_MOTION_TICKS
                 if message.motion.end_tick > limit:
                     raise BadInputError("end_tick", message.motion.end_tick, f"at most {limit}")
                 self.check_incarnation(message.bridge, now_s)

@@ -126,10 +126,10 @@ class Topic:
         return tuple(name for name in self.parameters if name in known)
 
     def checked(self, message: object, parameters: Mapping[str, str]) -> object:
-        """Return a message that has the names in its key: a sender has rights for its own keys.
+        """Return the message if its fields equal the parameters of the key.
 
         Raises:
-            BadInputError: it has another name.
+            BadInputError: a field differs: a router with access control checks keys only.
         """
         for name in self.named_in_key:
             value = getattr(message, name)

@@ -19,7 +19,7 @@ from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.lattice import Cell, Lattice, displacements
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.emergency_brake import EmergencyBrake
-from laneweave.protocol.wire.bounds import MAX_COLUMN, blocks_in_range
+from laneweave.protocol.wire.bounds import MAX_COLUMN, MAX_MOTION_TICKS, blocks_in_range
 from laneweave.protocol.wire.messages import Command, Neighbour
 
 NEIGHBOURING = frozenset(displacements(2)[1:])
@@ -28,8 +28,6 @@ BESIDE_M = 1.0
 """Net gap along the road below which another body is beside this one."""
 BEFORE_ENTERING = 0.4
 """Share of a move before a body touches the other lane."""
-MAX_MOTION_TICKS = 6000
-"""Maximum duration of a motion; the longest are those of vehicles that settle in their cells."""
 ERRORS_M = 1.0
 """Spare distance that may be missing because of measurement errors."""
 STOPPING_MPS = 3.0

@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 import pytest
-from attrs import evolve
 
 from laneweave.coordinator.ballots.ballot_round import (
     FAILED,
@@ -28,7 +27,6 @@ from laneweave.coordinator.formations.leader import (
     FormationLeader,
 )
 from laneweave.coordinator.formations.roster import Formation
-from laneweave.protocol.scenario.formation_table import DrivingStructure
 from laneweave.protocol.state_machine import RuleBook
 from laneweave.protocol.wire.messages import Ballot, CensusEntry, Name, Plan, Prepare, VehicleState
 from support.rule_books import RuleRecorder
@@ -38,7 +36,6 @@ from support.states import holding as state
 A, B, C = Name("A"), Name("B"), Name("C")
 OTHERS = Ballot(1, Name("other"), 1, 1)
 RESEND_S = 0.2
-STRUCTURE = DrivingStructure(550.0, "parallel", (0, 1))
 RNG = random.Random(1)
 Reach = Callable[..., tuple[FormationLeader, Ballot]]
 
@@ -145,21 +142,6 @@ def test_l2_adopts_a_plan_that_all_have_accepted_and_sends_nothing() -> None:
     assert list(leader.outgoing(100.0)) == []
     assert not leader.take(PROMISED, 100.0)
     assert leader.wakeup_s is None
-
-
-@pytest.mark.parametrize(("structure", "adopts"), [(None, True), (STRUCTURE, False)])
-def test_l2_a_completed_plan_may_be_that_of_an_earlier_structure(
-    structure: DrivingStructure | None, adopts: bool
-) -> None:
-    def adopted_if(**shown: Any) -> bool:  # noqa: ANN401 (fields)
-        leader = control(A, B)
-        stage = evolve(leader.formation.stage, structure=structure)
-        leader.formation = evolve(leader.formation, stage=stage)
-        hear(leader, *(state(name, OTHERS, accepted=True, **shown) for name in (A, B)))
-        return phase(leader) is BallotPhase.IN_FORCE
-
-    assert adopted_if(done=True, go=True) is adopts
-    assert adopted_if()  # while it is executed
 
 
 def test_a_vehicle_is_missed_only_after_the_plan_was_sent() -> None:

@@ -13,6 +13,7 @@ from laneweave.coordinator.formations.roster import exit_time_s, start_time_s
 from laneweave.protocol.lattice import Cell, PlannedMove
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.formation_table import FormationSettings
+from laneweave.protocol.scenario.vehicle_tables import Vehicle
 from laneweave.protocol.wire.messages import Plan
 from support.states import A, B, make_plan
 
@@ -46,18 +47,17 @@ def test_slots_are_the_longest_that_leave_a_reserve(steps: int, late_s: float) -
     chosen = paced(plan)
     assert chosen == replace(plan, slot_s=chosen.slot_s)
     timing = SCENARIO.timing
-    leisurely, hasty, without = (
+    leisurely, hasty = (
         max(
             (s for s in timing.slots_s if steps * s <= left_s(plan) - reserve_s),
             default=timing.slots_s[0],
         )
-        for reserve_s in (RESERVE_S, MIN_RESERVE_S, 0.0)
+        for reserve_s in (RESERVE_S, MIN_RESERVE_S)
     )
-    expected = leisurely
-    if leisurely < timing.comfortable_cycle_s:
-        # The reserve is given up only for gentle moves, and then only what they need of it.
-        use_all = hasty < timing.gentle_cycle_s <= without
-        expected = without if use_all else hasty
+    expected = leisurely if leisurely >= timing.comfortable_cycle_s else hasty
+    if expected < timing.gentle_cycle_s and steps * timing.gentle_cycle_s <= left_s(plan):
+        # The reserve is used for gentle moves, and only as much of it as they need.
+        expected = timing.gentle_cycle_s
     assert chosen.slot_s == pytest.approx(expected)
 
 
@@ -196,3 +196,13 @@ def test_a_pause_may_take_the_reserve() -> None:
     chosen, conflicts = beside(5.0, 3 * 5.0 - 0.1, scenario)
     assert steps_of(chosen) == 2
     assert conflicts == {0}
+
+
+def test_the_shortest_conflict_remains_also_if_the_shortest_slots_are_gentle() -> None:
+    """With a later start it lasts 2.8 s, without 3.8 s."""
+    quick = Vehicle(max_accel_mps2=6.0)
+    scenario = Scenario(vehicle=quick, formation=FormationSettings(gap_m=20.0))
+    assert scenario.timing.gentle_cycle_s == scenario.timing.slots_s[0]
+    chosen, conflicts = beside(4.0, 11.0, scenario)
+    assert len(conflicts) == 1
+    assert (chosen.slot_s, chosen.t0_s - CLOSING.t0_s) == pytest.approx((5.0, 1.0))

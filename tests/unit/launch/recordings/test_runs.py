@@ -31,6 +31,19 @@ def test_seeds_and_volumes_have_one_label(tmp_path: Path) -> None:
     assert len(Comparison.of(runs).at("rule", 900.0)) == 1
 
 
+def test_runs_over_zenoh_have_networks_of_their_own(tmp_path: Path) -> None:
+    """The launcher chooses the endpoint of a local run."""
+    endpoint = "unixsock-stream//tmp/x/router.sock"
+    fields: dict[str, Any] = {"network__endpoint": endpoint, "runtime__max_pace": 50.0}
+    runs = [run(tmp_path / "a"), run(tmp_path / "b", seed=2, **fields)]
+    assert labels_of(*runs) == ["formation", "formation"]
+
+
+def test_only_repetitions_are_labelled_by_their_folders(tmp_path: Path) -> None:
+    runs = [run(tmp_path / name, seed=seed) for name, seed in (("a", 1), ("b", 2), ("c", 2))]
+    assert sorted(labels_of(*runs)) == ["b", "c", "formation"]
+
+
 @pytest.mark.parametrize(
     "fields",
     [

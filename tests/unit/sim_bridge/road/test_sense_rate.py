@@ -11,6 +11,7 @@ from msgspec.structs import replace
 from laneweave.protocol.runtime.node import Arrived
 from laneweave.protocol.scenario.deployment_fields import MAX_HOLD_S
 from laneweave.protocol.vehicle.motion import cell_state
+from laneweave.protocol.wire.bounds import MAX_MOTION_TICKS
 from laneweave.protocol.wire.messages import (
     Ballot,
     ClosedFormation,
@@ -20,7 +21,6 @@ from laneweave.protocol.wire.messages import (
     Neighbour,
 )
 from laneweave.protocol.wire.topics import HEARTBEAT
-from laneweave.sim_bridge.bodies.command_checks import MAX_MOTION_TICKS
 from laneweave.sim_bridge.bodies.motion_controller import FallbackLevel, OffLatticePhase
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import NO_NEIGHBOURS, Neighbours
 from laneweave.sim_bridge.road.sense_rate import ACCEL_MPS2, GAP_M, SPEED_MPS
