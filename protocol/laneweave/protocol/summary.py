@@ -307,7 +307,7 @@ class ObstacleFigures:
     since_s: float = figure("road time at which the part was closed", "s")
     opened_s: float | None = optional("road time from which it was open again", "s")
     stopped: int = figure(
-        "vehicles that left the lattice in its lane before its end meanwhile", default=0
+        "vehicles that left the lattice meanwhile, in its lane and before its end", default=0
     )
     waited_s: float = figure("sum of the times until they were in cells again", "s", default=0.0)
     lowest_speed_mps: float | None = optional("lowest speed of a passing vehicle", "m/s")

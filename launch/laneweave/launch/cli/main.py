@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 TYPER_INTERRUPTED = 130
 """Exit status of typer after Ctrl-C."""
 _DISK_FAILURES = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO)
+"""Errors of a disk that is full or fails."""
 MAX_LINES = 20
 """Maximum number of errors of a file that are printed."""
 SIM_HINT = "the simulation packages: install laneweave[sim]"

@@ -78,7 +78,7 @@ class ClosedForATime:
 
 
 def closed_for_a_time(folder: Path) -> list[ClosedForATime]:
-    """Return the parts of lanes that were closed for a time, without vehicles of other systems.
+    """Return the parts of lanes that were closed for a time, except by vehicles of other systems.
 
     Raises:
         BadInputError: the events cannot be read.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -105,7 +106,7 @@ class Comparison:
         """
         all_runs = list({(run.folder.resolve(), run.order): run for run in runs}.values())
         listed = all_runs
-        for name in (_last_part, str):
+        for name in (attrgetter("name"), str):
             alike, counts = _labels_of_like_runs(listed), Counter(run.order for run in listed)
             listed = [
                 run
@@ -180,15 +181,11 @@ def _labels_of_like_runs(runs: Iterable[Run]) -> set[str]:
 
 
 def _labelled_by_folder(run: Run, name: Callable[[Path], str]) -> Run:
-    """Return a run whose label names its folder, or besides its label that of its sweep."""
+    """Return a run that is labelled by its folder; one of a sweep by its label and the sweep's."""
     folder = run.folder.resolve()
     if is_sweep(folder.parent):
         return evolve(run, label=f"{run.label} ({name(folder.parent)})")
     return evolve(run, label=name(folder))
-
-
-def _last_part(path: Path) -> str:
-    return path.name
 
 
 def flatten(tables: Mapping[str, Any], separator: str) -> dict[str, Any]:

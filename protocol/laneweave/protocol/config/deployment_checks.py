@@ -102,7 +102,7 @@ def check_security(scenario: Scenario) -> None:
 
 
 def check_secured_demand(scenario: Scenario) -> None:
-    """Check that a secured router can have rules for all vehicles of a demand that is valid."""
+    """Check fleets and the number of vehicles under access control; the demand must be valid."""
     if scenario.security.mode != "mtls":
         return
     _check_fleet_names(scenario)

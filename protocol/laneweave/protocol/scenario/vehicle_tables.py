@@ -12,7 +12,7 @@ from laneweave.protocol.field_validators import key_part, one_of, within, within
 PEAK_ACCEL = 10.0 / math.sqrt(3.0)
 """Peak acceleration of a minimum-jerk move by d in T, in d / T^2."""
 PEAK_JERK = 60.0
-"""Peak jerk of such a move, in d / T^3."""
+"""Peak jerk of a minimum-jerk move by d in T, in d / T^3."""
 MAX_HORIZON_TICKS = 200
 """Maximum horizon of the tracker."""
 

@@ -71,7 +71,7 @@ class Territory:
         return True
 
     def owned_among(self, _cells: Iterable[Cell]) -> Iterable[Cell]:
-        """Return which of the cells reserved for a vehicle it owns once it enters again."""
+        """Return the reserved cells that a vehicle owns once it has entered again."""
         return ()
 
     def transfer_of_departed(self, record: VehicleRecord) -> PendingTransfer | None:

@@ -29,7 +29,7 @@ from laneweave.sim_bridge.road.demand_queue import OnRoad, OnRoadT
 REACTION_S = 0.5
 """Time in which a vehicle that is given back keeps its speed."""
 AS_FAST_MPS = 0.5
-"""Difference to v_F up to which no vehicle has to brake for a vehicle."""
+"""Maximum difference to v_F at which others need not brake for a vehicle."""
 STANDING_MPS, STANDING_M = 1.0, 8.0
 """Speed below which a vehicle stands, and its distance from another one of the same queue."""
 STUCK_MPS = 0.1

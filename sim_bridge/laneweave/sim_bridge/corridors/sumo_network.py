@@ -18,7 +18,7 @@ CARS = "passenger"
 IGNORING = "ignoring"
 """Class of vehicles that may drive anywhere."""
 _HAS_PRIORITY = "M"
-"""State of a link whose vehicles give way to no vehicle."""
+"""State of a link whose vehicles have priority over all others."""
 ZIPPER = "Z"
 """State of a link whose vehicles pass in turn with those of another one into the same lane."""
 _MOST_ACROSS = 8
@@ -101,7 +101,7 @@ class Link:
 
     @property
     def has_priority(self) -> bool:
-        """Whether vehicles give way to no vehicle."""
+        """Whether its vehicles have priority over all others, without a traffic light."""
         return not self.traffic_light and self.state == _HAS_PRIORITY
 
 
