@@ -37,7 +37,12 @@ class Leader:
         core.election.term = term
         self.name, self.incarnation = name, incarnation
         self.control = FormationLeader(
-            formation, core._new_ballot, random.Random(0), resend_s=RESEND_S, rules=rules
+            formation,
+            core._new_ballot,
+            random.Random(0),
+            has_formed=lambda *_: True,
+            resend_s=RESEND_S,
+            rules=rules,
         )
 
     @property

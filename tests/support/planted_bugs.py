@@ -257,6 +257,7 @@ NOT_A_SAFETY_MATTER: Mapping[Function, str] = {
     vehicle.both_lanes_are_open: "it delays moves that are planned for later in a slot",
     vehicle.ends_in_time: "a move that begins late is stopped at the stop line of its lane",
     leader.observe_members: "how long a leader listens is a matter of progress",
+    leader.lacks_structure: "without it, the structure of an earlier stage is kept",
     leader.has_lost_member: "without it, others hold until they stop, too",
     leader.back_off: "the length of a pause is a matter of progress",
     ballot.had_promised: "it only guards `void_promise` and `record_restart`",

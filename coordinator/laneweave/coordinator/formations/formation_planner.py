@@ -6,10 +6,11 @@ requests. It turns results into plans or failures, or joins formations if one al
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Collection, Iterator, Mapping
 from functools import partial
 
-from attrs import define, field
+from attrs import define, evolve, field
 
 from laneweave.coordinator.ballots.ballot_round import FAILED, TOO_LATE, BallotPhase
 from laneweave.coordinator.formations.leader import FormationLeader
@@ -26,7 +27,12 @@ from laneweave.coordinator.formations.roster import (
     stage_end_s,
     steps_left,
 )
-from laneweave.coordinator.formations.sorting import Sorting, SortingTask, sort_lanes
+from laneweave.coordinator.formations.sorting import (
+    Sorting,
+    SortingTask,
+    has_formed,
+    sort_lanes,
+)
 from laneweave.coordinator.formations.stages import Stage
 from laneweave.coordinator.operation import LogEntry
 from laneweave.coordinator.planning.budget import Clock
@@ -48,7 +54,7 @@ from laneweave.protocol.wire.events import (
     STRUCTURE_IMPOSSIBLE,
     STRUCTURE_TOO_LATE,
 )
-from laneweave.protocol.wire.messages import Ballot, Name, Plan
+from laneweave.protocol.wire.messages import Ballot, Name, Plan, VehicleState
 
 START_MARGIN_S = 0.5
 """Minimum road time from the end of planning to the start of the plan."""
@@ -171,22 +177,11 @@ class FormationPlanner:
             yield LogEntry(FORMATION_TOO_LATE, self._too_late(leader, cells))
             leader.take(TOO_LATE, now_s)
             return
-        task = SortingTask(
-            numbers,
-            leader.hold_cells,
-            formation.goal_lanes,
-            leader.unattended | too_late,
-            scenario,
+        task = evolve(
+            self._task(formation, leader.promises),
+            unattended=leader.unattended | too_late,
             deadline_s=self._deadline_s(start_s, t_s),
             steps=comfortable_steps(start_s, end_s, scenario),
-            deserted=formation.deserted,
-            structure=stage.structure,
-            stage=stage if formation.sorts else None,
-            moves={
-                member.vehicle: moves
-                for member in formation.members
-                if (moves := scenario.types.moves_of(member.vehicle_type)) is not None
-            },
             too_late=too_late - leader.unattended,
         )
         nodes = scenario.formation.max_nodes * 2 ** min(leader.failures, MAX_DOUBLINGS)
@@ -195,6 +190,30 @@ class FormationPlanner:
         # The job detects invalid promises; they are handled like any planning failure.
         self._waiting[numbers[0]] = ballot, partial(sort_lanes, task, nodes, self._make_plan)
         yield from self._begin()
+
+    def has_formed(self, formation: Formation, states: Mapping[Name, VehicleState]) -> bool:
+        """Return whether a formation has the structure of its stage, if there is one."""
+        return has_formed(self._task(formation, states))
+
+    def _task(self, formation: Formation, states: Mapping[Name, VehicleState]) -> SortingTask:
+        """Return the task of a formation from its members' states, without a deadline."""
+        scenario, roster, stage = self._scenario, formation.roster, formation.stage
+        return SortingTask(
+            formation.numbers,
+            {name: states[name].hold_cell for name in roster},
+            formation.goal_lanes,
+            frozenset(name for name in roster if not states[name].attended),
+            scenario,
+            deadline_s=math.inf,
+            deserted=formation.deserted,
+            structure=stage.structure,
+            stage=stage if formation.sorts else None,
+            moves={
+                member.vehicle: moves
+                for member in formation.members
+                if (moves := scenario.types.moves_of(member.vehicle_type)) is not None
+            },
+        )
 
     def _too_late(self, leader: FormationLeader, cells: Collection[Cell]) -> dict[str, object]:
         """Return which vehicles do not sort their lanes, as it is too late for any step, and why.

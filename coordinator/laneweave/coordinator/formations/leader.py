@@ -8,7 +8,7 @@ table, shown in docs/PROTOCOL.md. L1 is `election.Election`.
 from __future__ import annotations
 
 import random
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 
 from attrs import define, field
 
@@ -58,6 +58,8 @@ class FormationLeader(BallotRound):
     new_ballot: Callable[[Ballot | None], Ballot]
     """Returns a new ballot, above the given one, if any."""
     rng: random.Random
+    has_formed: Callable[[Formation, Mapping[Name, VehicleState]], bool]
+    """Returns whether members with these states form the structure of the stage, if any."""
     rules: RuleBook = field(factory=lambda: LEADER_RULES, kw_only=True)
     phase: BallotPhase = field(default=BallotPhase.OBSERVING, kw_only=True)
     out_of_reach: frozenset[Name] = frozenset()
@@ -178,6 +180,7 @@ def one_plan_is_in_force(leader: FormationLeader, _: object) -> bool:
 def adopt(leader: FormationLeader, _: object) -> None:
     """Adopt the plan: send nothing, monitor states."""
     leader.ballot = next(iter(leader.states.values())).record.promised
+    leader.plan = None
     # The promises were given to another leader; acceptance implies a promise.
     leader.promises = dict(leader.states)
     leader.back_offs = 0
@@ -243,6 +246,18 @@ def is_off_lane(leader: FormationLeader, state: VehicleState) -> bool:
     )
 
 
+def lacks_structure(leader: FormationLeader, _: object) -> bool:
+    """An adopted plan is complete, and the members do not form the structure of the stage.
+
+    The plan may have been made for an earlier stage.
+    """
+    return (
+        leader.plan is None
+        and all(leader.states[name].done for name in leader.roster)
+        and not leader.has_formed(leader.formation, leader.states)
+    )
+
+
 def has_new_targets(leader: FormationLeader, formation: Formation) -> bool:
     """There are new members or targets, or the structure to form has changed."""
     return formation.stage != leader.formation.stage or not (
@@ -287,6 +302,7 @@ LEADER_RULES: RuleBook = RuleBook(
         Transition("L8", TIME, _ISSUING, (time_is_up,), *_PREPARE),
         Transition("L8", STATE, _IN_FORCE, (stalls,), *_PREPARE),
         Transition("L8", STATE, _IN_FORCE, (is_off_lane,), *_PREPARE),
+        Transition("L8", STATE, _IN_FORCE, (lacks_structure,), *_PREPARE),
         Transition("L8", MEMBERS, UNFINISHED, (), *_PREPARE),
         Transition("L8", MEMBERS, _IN_FORCE, (has_new_targets,), *_PREPARE),
         Transition("L8", MEMBERS, _IN_FORCE, (has_lost_member,), *_PREPARE),

@@ -224,6 +224,7 @@ class FormationsOperation:
             formation,
             self._new_ballot,
             self._rng,
+            self._planner.has_formed,
             resend_s=self._scenario.network.resend_s,
             rules=self._rules,
         )

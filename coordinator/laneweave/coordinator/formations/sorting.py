@@ -21,6 +21,7 @@ from attrs import evolve, field, frozen
 from laneweave.coordinator.formations.roster import Numbers
 from laneweave.coordinator.formations.stages import Stage
 from laneweave.coordinator.planning.budget import Clock
+from laneweave.coordinator.planning.formation_structures import is_formed, shortage
 from laneweave.coordinator.planning.grid import Grid
 from laneweave.coordinator.planning.request import MAX_STEPS, PlanRequest, VehicleRequest
 from laneweave.coordinator.planning.response import PlanFunction, PlanResponse
@@ -335,6 +336,17 @@ def _form(
             raise
         return evolve(_sorting(task, None), impossible=error.allowed)
     return _sorting(task, make_plan(request))
+
+
+def has_formed(task: SortingTask) -> bool:
+    """Return whether the members that can move form the structure, or have too little room."""
+    if task.structure is None:
+        return True
+    movers = [*task.movers.values()]
+    grid = Grid(len(task.columns), task.scenario.road.lanes, task.blocked)
+    lanes = task.structure.lanes or range(grid.lanes)
+    form, unnamed = task.structure.structure, [None] * len(movers)
+    return bool(shortage(form, lanes, grid, unnamed)) or is_formed(form, lanes, grid, movers)
 
 
 def _sorting(task: SortingTask, response: PlanResponse | None) -> Sorting:

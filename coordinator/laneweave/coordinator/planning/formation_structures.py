@@ -73,6 +73,24 @@ def shortage(
     return None if None in found else found[0]
 
 
+def is_formed(structure: str, lanes: Sequence[int], grid: Grid, cells: Sequence[Cell]) -> bool:
+    """Return whether vehicles that name no lane form a structure, wherever its front is.
+
+    Args:
+        structure: one of `STRUCTURES`.
+        lanes: lanes of the structure.
+        grid: the grid with its blocked cells.
+        cells: current cells of the vehicles.
+    """
+    unnamed, occupied = [None] * len(cells), sorted(cells)
+    return any(
+        sorted(_fill(front, lanes_of, unnamed) or ()) == occupied
+        for columns in _variants(structure, lanes, grid)
+        for lanes_of in (_lanes_by_column(columns),)
+        for front in lanes_of
+    )
+
+
 def ranked_runs(
     columns: Sequence[int], free: Sequence[int], width: int, *, ahead: bool = False
 ) -> list[tuple[float, int]]:
@@ -149,10 +167,7 @@ def _filled(
     columns: _Columns, grid: Grid, starts: Sequence[int], preferred: Sequence[int | None]
 ) -> _Placed:
     """Fill a structure from each front; return the result nearest to the starts."""
-    lanes_of: dict[int, list[int]] = {}
-    for lane in sorted(columns):
-        for column in columns[lane]:
-            lanes_of.setdefault(column, []).append(lane)
+    lanes_of = _lanes_by_column(columns)
     starts_in_order = np.sort(starts)
     found: list[_Placed] = []
     for front in sorted(lanes_of):
@@ -164,6 +179,15 @@ def _filled(
             )
             found.append((distance, targets))
     return min(found, key=lambda one: one[0])
+
+
+def _lanes_by_column(columns: _Columns) -> dict[int, list[int]]:
+    """Return the lanes of a structure's cells, ascending, for each column that has any."""
+    lanes_of: dict[int, list[int]] = {}
+    for lane in sorted(columns):
+        for column in columns[lane]:
+            lanes_of.setdefault(column, []).append(lane)
+    return lanes_of
 
 
 def _fill(

@@ -65,10 +65,11 @@ def control(
     begin_s: float = 0.0,
     observe: bool = True,
     rules: RuleBook = LEADER_RULES,
+    forms: Callable[..., bool] = lambda *_: True,
 ) -> FormationLeader:
     """Return a leader that has just begun."""
     members = formation(*names, numbers=numbers)
-    leader = FormationLeader(members, Ballots(), RNG, resend_s=RESEND_S, rules=rules)
+    leader = FormationLeader(members, Ballots(), RNG, forms, resend_s=RESEND_S, rules=rules)
     leader.begin(begin_s, observe=observe)
     return leader
 
@@ -539,6 +540,29 @@ def test_l8_a_vehicle_on_the_wrong_lane_needs_a_new_plan_unless_planned_so(
     assert phase(leader) is then
 
 
+def test_l8_an_adopted_plan_may_have_formed_the_structure_of_an_earlier_stage() -> None:
+    formed = {(0, 2)}
+    leader = control(A, B, forms=lambda _, states: {states[A].hold_cell} == formed)
+    hear(leader, *(state(name, OTHERS, accepted=True) for name in (A, B)))
+    hear(leader, astray(promised=OTHERS, hold_cell=(0, 1)))
+    assert phase(leader) is BallotPhase.IN_FORCE  # B is still under way
+    hear(leader, state(B, OTHERS, accepted=True, done=True, t_s=1.0))
+    assert prepares_anew(leader, OTHERS)
+
+
+def test_l8_nothing_is_planned_again_once_the_structure_is_formed_or_was_planned() -> None:
+    leader = control(A)
+    hear(leader, astray(promised=OTHERS, hold_cell=(0, 1)))
+    assert phase(leader) is BallotPhase.IN_FORCE
+    leader = control(A, forms=lambda *_: False)
+    hear(leader, state(A))
+    hear(leader, state(A, leader.ballot, t_s=1.0))
+    assert leader.take(PROMISED, 0.0)
+    leader.on_plan(plan_of(leader), 0.0)
+    hear(leader, astray(hold_cell=(0, 1), t_s=2.0))
+    assert phase(leader) is BallotPhase.IN_FORCE
+
+
 def test_l8_out_of_reach_in_an_own_plan_may_be_astray_in_an_adopted_one() -> None:
     leader, ballot = planning(A)
     leader.on_plan(plan_of(leader), 0.0, [A])
@@ -653,7 +677,9 @@ def test_a_vehicle_that_restarts_while_its_ballot_is_outbid_is_asked_again() -> 
 def test_in_random_histories_ballots_only_rise_and_every_rule_is_used() -> None:
     book = RuleRecorder(LEADER_RULES)
     ballots = [
-        run_random_history(control(A, B, rules=book), random.Random(seed)) for seed in range(100)
+        run_random_history(control(A, B, rules=book, forms=forms), random.Random(seed))
+        for seed in range(100)
+        for forms in (lambda *_: True, lambda *_: False)
     ]
     assert max(ballots) > 10
     hidden = set(range(len(LEADER_RULES.table))) - {*book.taken}

@@ -8,11 +8,16 @@ from typing import Any
 import attrs
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy.optimize import linear_sum_assignment
 
-from laneweave.coordinator.planning.formation_structures import STRUCTURES, structure_targets
+from laneweave.coordinator.planning.formation_structures import (
+    STRUCTURES,
+    is_formed,
+    shortage,
+    structure_targets,
+)
 from laneweave.coordinator.planning.grid import Grid
 from laneweave.coordinator.planning.plan_validator import problems_of_response
 from laneweave.coordinator.planning.request import PlanRequest
@@ -122,6 +127,37 @@ def shortest_total_way(
 
 @pytest.mark.slow
 @examples(300)
+@given(crowds(), st.sampled_from(STRUCTURES))
+def test_targets_of_vehicles_that_name_no_lane_form_the_structure(
+    crowd: tuple[Grid, list[Cell], list[int | None]], structure: str
+) -> None:
+    grid, cells, _ = crowd
+    lanes = range(grid.lanes)
+    assume(shortage(structure, lanes, grid, [None] * len(cells)) is None)
+    targets = structure_targets(structure, lanes, grid, cells, [None] * len(cells))
+    assert is_formed(structure, lanes, grid, targets)
+    if not any({*cells} <= {*cells_of(structure, grid, parity)} for parity in (0, 1)):
+        assert not is_formed(structure, lanes, grid, cells)
+
+
+@for_each(
+    ("structure", "cells", "formed"),
+    [
+        ("parallel", [(3, 0), (3, 1), (3, 2)], True),
+        ("parallel", [(3, 0), (3, 1), (1, 0)], False),  # a gap
+        ("parallel", [(3, 1), (3, 2)], False),  # filled from the left
+        ("interlaced", [(4, 0), (4, 2), (3, 1)], True),
+        ("interlaced", [(5, 0), (5, 2), (4, 1)], True),
+        ("interlaced", [(5, 0), (5, 2), (4, 0)], False),  # even and odd cells
+        ("parallel", [], True),
+    ],
+)
+def test_structures_are_formed_wherever_their_front_is(
+    structure: str, cells: list[Cell], formed: bool
+) -> None:
+    assert is_formed(structure, range(3), Grid(8, 3), cells) is formed
+
+
 @given(crowds(), st.sampled_from(STRUCTURES))
 def test_targets_are_a_structure_with_the_shortest_total_distance(
     crowd: tuple[Grid, list[Cell], list[int | None]], structure: str

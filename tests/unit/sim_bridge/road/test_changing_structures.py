@@ -22,6 +22,8 @@ from support.paper import EXACT
 
 pytestmark = pytest.mark.slow
 
+BEFORE_STAGE_S = 40.2
+"""Just before the last vehicle passes the beginning of the second structure."""
 LOOK_S = 0.5
 """How long before a change the cells are looked at."""
 
@@ -31,12 +33,19 @@ Cells = dict[float, dict[str, Cell]]
 
 
 def drive(
-    scenario: Scenario, folder: Path, arrivals: tuple[Arrival, ...]
+    scenario: Scenario,
+    folder: Path,
+    arrivals: tuple[Arrival, ...],
+    leader_hangs_s: float | None = None,
 ) -> tuple[list[dict[str, Any]], Cells]:
     """Drive a demand to its end; return the events and the cells of all vehicles."""
     street = Street(scenario, folder, arrivals)
-    street.start_coordinators(2)
+    candidates = {name: street.start_coordinator(name, 1) for name in ("c0", "c1")}
     street.start_shard()
+    if leader_hangs_s is not None:
+        street.run(lambda: street.bridge.t_s >= leader_hangs_s)
+        (leader,) = (name for name, core in candidates.items() if core.election.leading)
+        street.network.pause(leader)
     cells: Cells = {}
 
     def ended() -> bool:
@@ -62,7 +71,11 @@ def of_kind(events: list[dict[str, Any]], kind: str) -> list[dict[str, Any]]:
 
 
 @pytest.mark.more
-def test_a_formation_takes_on_one_structure_after_the_other(tmp_path: Path) -> None:
+@pytest.mark.parametrize("leader_hangs", [False, True])
+def test_a_formation_takes_on_one_structure_after_the_other(
+    tmp_path: Path, leader_hangs: bool
+) -> None:
+    """Also if the leader hangs when the next stage begins: the new one adopts the last plan."""
     scenario = parse_scenario(
         {
             "road": {"lanes": 3, "s1_m": 50.0, "s2_m": 950.0, "s3_m": 400.0},
@@ -76,7 +89,7 @@ def test_a_formation_takes_on_one_structure_after_the_other(tmp_path: Path) -> N
         }
     )
     arrivals = tuple(arrival(f"v{n}", 1.0 + 0.8 * n, n % 3, (n + 1) % 3) for n in range(6))
-    events, cells = drive(scenario, tmp_path, arrivals)
+    events, cells = drive(scenario, tmp_path, arrivals, BEFORE_STAGE_S if leader_hangs else None)
     plans = of_kind(events, "plan-made")
     assert [plan["vehicles"] for plan in plans] == [6, 6, 6]
     assert {plan["solver"] for plan in plans} == {"branching"}
