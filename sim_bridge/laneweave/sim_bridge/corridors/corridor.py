@@ -438,18 +438,22 @@ class _Derivation:
         """Return length, lowest speed limit and links of the way on which vehicles come to a link.
 
         It begins where others join, where vehicles depart or have to give way, or where it has
-        more lanes.
+        more lanes. Edges that SUMO's vehicles use for another way, or from which not every lane
+        leads on, are not part of it.
         """
         length_m, speed_mps, path = 0.0, link.origin.speed_mps, list[Link]()
         seen = set[str]()
         while link.has_priority and link.origin.name not in seen and length_m < MAX_RAMP_M:
             lane = link.origin
+            lanes = self._network.edges[lane.edge].car_lanes
+            ways = [{on.target.edge for on in self._network.links_from(one)} for one in lanes]
+            if any(edges != {link.target.edge} for edges in ways):
+                break
             seen.add(lane.name)
             path.append(link)
             length_m += lane.length_m + link.length_m
             speed_mps = min(speed_mps, lane.speed_mps)
             before = self._network.links_to(lane)
-            lanes = self._network.edges[lane.edge].car_lanes
             if len(before) != 1 or len(lanes) > 1 or lane.edge in self._departing:
                 break
             link = before[0]

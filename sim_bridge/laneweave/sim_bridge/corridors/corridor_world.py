@@ -89,9 +89,18 @@ class CorridorWorld(SumoProcess, BodiesWorld):
             SumoUnavailableError: libsumo cannot be loaded.
             SumoFailedError: SUMO rejects a file.
         """
+        scenario, found, corridor = setup.scenario, setup.found, setup.found.corridor
+        entrances = {one.name for one in scenario.entrance}
+        if any(one.origin.upstream for one in setup.arrivals):
+            entrances.add(MAIN_ENTRANCE)
+        ways = [one for one in found.ways_in if one.entrance in entrances]
+        self.start_lanes = tuple(one.lane for one in ways if one.entrance == MAIN_ENTRANCE)
+        """Lanes to whose beginning vehicles come from upstream."""
+        if closed := {*self.start_lanes} - {*scenario.road.first_lanes}:
+            allowed = "lanes that are open at the start, to which vehicles come from upstream"
+            raise BadInputError("road.closures", f"lane {min(closed)}", allowed)
         super().__init__(setup.command(folder, results, _PLANTS))
         BodiesWorld.__init__(self)
-        scenario, found, corridor = setup.scenario, setup.found, setup.found.corridor
         self._shape = CorridorShape(corridor)
         self._sumo_name = {one.arrival.vehicle: one.origin.vehicle.name for one in setup.arrivals}
         self._coming = dict(setup.by_name)
@@ -104,20 +113,13 @@ class CorridorWorld(SumoProcess, BodiesWorld):
         """Vehicles that have arrived without coming to their entrances."""
         self._slowing: dict[str, _Slowing] = {}
         """Vehicles that slow down since a lower limit is ahead, by name."""
-        entrances = {one.name for one in scenario.entrance}
-        if any(one.origin.upstream for one in setup.arrivals):
-            entrances.add(MAIN_ENTRANCE)
-        ways = [one for one in found.ways_in if one.entrance in entrances]
-        self.start_lanes = tuple(one.lane for one in ways if one.entrance == MAIN_ENTRANCE)
-        """Lanes to whose beginning vehicles come from upstream."""
         geometry = scenario.geometry
-        if closed := {*self.start_lanes} - {*scenario.road.first_lanes}:
-            allowed = "lanes that are open at the start, to which vehicles come from upstream"
-            raise BadInputError("road.closures", f"lane {min(closed)}", allowed)
         self._ways_in = {
             geometry.entry_point_of(one.ramp) if one.ramp else one.lane: one for one in ways
         }
         """The ways to the entry points to which SUMO drives vehicles."""
+        self._watched = frozenset(name for way in ways for name in way.lanes)
+        """Lanes on which vehicles come to their entrances."""
         self.departing = tuple(
             one.arrival for one in setup.arrivals if one.near and not one.origin.departs_at_start
         )
@@ -191,8 +193,9 @@ class CorridorWorld(SumoProcess, BodiesWorld):
         for name, (lane, exit_m, from_m) in self._beyond:
             inside = from_m < exit_m
             for vehicle in self.lane.getLastStepVehicleIDs(name):
-                if inside and vehicle in self._coming:
-                    continue  # it is driven here, or on its way to its entrance
+                coming = self._coming.get(vehicle)
+                if inside and coming and (name in self._watched or self._drives(coming)):
+                    continue  # on its way to its entrance, or driven here
                 length_m = api.getLength(vehicle)
                 rear_m = from_m + api.getLanePosition(vehicle) - length_m
                 if rear_m <= exit_m + SEEN_BEYOND_M:
@@ -201,7 +204,11 @@ class CorridorWorld(SumoProcess, BodiesWorld):
 
     def _is_outside(self, coming: CorridorArrival) -> bool:
         """Return whether SUMO drives a vehicle to its entrance."""
-        return not (coming.origin.departs_at_start or coming.arrival.vehicle in self.states)
+        return not (coming.origin.departs_at_start or self._drives(coming))
+
+    def _drives(self, coming: CorridorArrival) -> bool:
+        """Return whether a vehicle has been taken over."""
+        return coming.arrival.vehicle in self.states
 
     # --- the interface of worlds --------------------------------------------------------------
 

@@ -33,6 +33,7 @@ from laneweave.sim_bridge.corridors.settling import SLOW_ENTRY_S
 from laneweave.sim_bridge.corridors.sumo_corridor import Pass, SumoCorridor
 from laneweave.sim_bridge.corridors.sumo_simulation import SumoType
 
+MIN_VOLUME_VEH_PER_H = 0.1
 MAX_VOLUME_VEH_PER_H = 3600.0
 MIN_SETTLE_S = 1.0
 SPARE_PITCH_M = 2.0
@@ -258,7 +259,8 @@ def _check_widths(corridor: Corridor, names: Mapping[SumoType, str]) -> None:
 
 def _volume(vehicles: int, duration_s: float, lanes: int = 1) -> float:
     """Return a volume [veh/h] as scenarios allow it; it is that of a drawn demand only."""
-    return min(round(3600.0 / duration_s * vehicles / lanes, 1), MAX_VOLUME_VEH_PER_H)
+    volume = round(3600.0 / duration_s * vehicles / lanes, 1)
+    return min(max(volume, MIN_VOLUME_VEH_PER_H), MAX_VOLUME_VEH_PER_H)
 
 
 def _rounded_mps(speed_mps: float) -> float:
@@ -313,7 +315,7 @@ def _part(lane: int, from_m: float, to_m: float) -> dict[str, Any]:
 def _destinations(passes: Sequence[Pass]) -> list[dict[str, Any]]:
     counts = Counter(one.destination for one in passes)
     return [
-        {"exit": name, "share": round(count / len(passes), 4)}
+        {"exit": name, "share": _share(count, len(passes))}
         for name, count in sorted(counts.items())
         if name != END_OF_ROAD
     ]
@@ -330,7 +332,12 @@ def _lane_shares(passes: Sequence[Pass], lanes: int) -> list[float]:
 
 def _shares_of_types(passes: Sequence[Pass]) -> Mapping[SumoType, float]:
     counts = Counter(one.vehicle.vehicle_type for one in passes)
-    return {kind: round(count / len(passes), 4) for kind, count in counts.items()}
+    return {kind: _share(count, len(passes)) for kind, count in counts.items()}
+
+
+def _share(count: int, total: int) -> float:
+    """Return a share, rounded down, so that the sum of all is at most 1."""
+    return 10_000 * count // total / 10_000
 
 
 def _motion(tables: Tables, corridor: Corridor, speed_mps: float) -> dict[str, Any]:
@@ -352,7 +359,10 @@ def _motion(tables: Tables, corridor: Corridor, speed_mps: float) -> dict[str, A
         name = min(ramps_m, key=ramps_m.__getitem__)
         ramp = next(one for one in corridor.ramps if one.name == name)
         if not ramp.path:
-            allowed = "on-ramps whose vehicles have priority where their acceleration lanes begin"
+            allowed = (
+                "on-ramps whose vehicles have priority where their acceleration lanes begin, and "
+                "whose edges lead nowhere else"
+            )
             raise BadInputError(f"{OPTION} {corridor.name}, on-ramp", ramp.edge, allowed)
         raise BadInputError(
             f"{OPTION} {corridor.name}, length of the on-ramp from {ramp.edge}",

@@ -35,6 +35,7 @@ from support.interchange import (
     POCKET,
     RAMP_SPEED_MPS,
     TRUCKS,
+    scenario_of,
     stream,
     vehicle,
     write_interchange,
@@ -172,6 +173,47 @@ def test_each_lane_of_a_ramp_is_an_entrance(network: Network) -> None:
     first, second = corridor.ramps
     assert (first.edge, second.edge, first.lane, second.lane) == ("on", "on", 0, 1)
     assert first.name == first.entrance == second.entrance != second.name
+
+
+def with_way_out(network: Network, edge: str, index: int) -> Network:
+    """Return the network with another edge, to which the lane of an edge with this index leads."""
+    from_edge, on = network.edges[edge], network.edges["on"]
+    lanes = [*from_edge.lanes]
+    if index == len(lanes):
+        lanes.append(evolve(lanes[0], name=f"{edge}_{index}", index=index))
+    away = Edge("away", (evolve(on.lanes[0], name="away_0", edge="away"),))
+    links = (*network.links, Link(lanes[index], away.lanes[0]))
+    edges = {**network.edges, edge: evolve(from_edge, lanes=tuple(lanes)), "away": away}
+    return Network(edges, links)
+
+
+@pytest.mark.parametrize(
+    ("edge", "index", "path"),
+    [("before", 0, ["on"]), ("before", 1, ["on"]), ("on", 0, []), ("on", 1, [])],
+)
+def test_a_ramp_begins_behind_edges_that_lead_elsewhere_too(
+    network: Network, edge: str, index: int, path: list[str]
+) -> None:
+    """SUMO drives other vehicles there."""
+    (whole,) = corridor_of(network, "main1", "main5").ramps
+    assert [link.origin.edge for link in whole.path] == ["on", "before"]
+    (ramp,) = corridor_of(with_way_out(network, edge, index), "main1", "main5").ramps
+    assert [link.origin.edge for link in ramp.path] == path
+
+
+def test_a_ramp_begins_behind_edges_with_lanes_that_end(network: Network) -> None:
+    """Vehicles in them would come to the ramp's lane after it has begun."""
+    before = network.edges["before"]
+    lanes = (*before.lanes, evolve(before.lanes[0], name="before_1", index=1))
+    edges = {**network.edges, "before": evolve(before, lanes=lanes)}
+    (ramp,) = corridor_of(Network(edges, network.links), "main1", "main5").ramps
+    assert [link.origin.edge for link in ramp.path] == ["on"]
+
+
+def test_a_ramp_whose_last_edge_leads_elsewhere_too_is_refused(interchange: SumoCorridor) -> None:
+    network = with_way_out(interchange.simulation.network, "on", 0)
+    with pytest.raises(BadInputError, match="lead nowhere else"):
+        checked(interchange, ramps=corridor_of(network, "main1", "main5").ramps)
 
 
 def test_vehicles_must_not_have_to_give_way_on_a_corridor(network: Network) -> None:
@@ -328,6 +370,19 @@ def test_to_a_turn_pocket_sumo_drives_from_the_lane_beside_it(tmp_path: Path) ->
     (approach,) = find_approaches(signals)
     assert (approach.name, approach.control) == ("main1:main2", "light")
     assert [(one.edge, one.lanes) for one in approach.turns] == [("ahead", (0, 1)), ("left", (2,))]
+
+
+def test_shares_of_types_that_are_no_round_figures_are_valid(tmp_path: Path) -> None:
+    types = (
+        f'{TRUCKS}<vType id="van" vClass="delivery" length="6" sigma="0"/>'
+        '<vType id="bus" vClass="bus" length="7" accel="1.5" decel="4.1" sigma="0"/>'
+    )
+    kinds = ("truck", "van", *4 * ("bus",))
+    by_ramp = [vehicle(f"r{n}", 30 + 4 * n, "ramp", kind) for n, kind in enumerate(kinds)]
+    ahead = [vehicle(f"m{n}", 2 * n, "main") for n in range(12)]
+    config = write_interchange(tmp_path, [*ahead, *by_ramp], types=types)
+    shares = [one.share for one in scenario_of(config).entrance[0].vehicle_types]
+    assert 0.999 < sum(shares) <= 1.0
 
 
 def test_more_vehicles_than_the_road_carries_wait_and_prefer_no_lane(tmp_path: Path) -> None:
