@@ -21,7 +21,7 @@ from laneweave.agents.driving.stop_lines import StopLines
 from laneweave.agents.driving.surroundings import Surroundings
 from laneweave.agents.driving.tracker import Tracker
 from laneweave.agents.driving.tracking_problem import NO_GAPS
-from laneweave.protocol.lattice import Cell, PlannedMove
+from laneweave.protocol.lattice import Cell, PlannedMove, displacements
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.vehicle_tables import Vehicle
 from laneweave.protocol.vehicle.lane_ends import LaneEnds
@@ -120,6 +120,7 @@ class TrackingDriver:
         """Cell in which the newest motion began; the goal once that motion has ended."""
         self._goal: Cell = (0, 0)
         self._durations = scenario.timing.move_durations
+        self._displacements = displacements(scenario.formation.mode)
         self._ticks = 0
         """Duration of the newest move [ticks]."""
         self._lattice = scenario.lattice
@@ -139,12 +140,14 @@ class TrackingDriver:
         """Continue the motion controller's current motion."""
         self._origin = self._goal = sense.hold_cell
         self._settling, motion = None, sense.motion
+        (column, lane), (origin_column, origin_lane) = sense.hold_cell, motion.origin
+        is_move = (column - origin_column, lane - origin_lane) in self._displacements
         if motion.origin == sense.hold_cell and motion.end_tick > sense.tick + 3:
             commanded = self._commanded(sense)
             self._reference = self._settling = Reference.settling(
                 *self._own, sense.hold_cell, commanded, sense.tick, motion.end_tick
             )
-        elif motion.end_tick > sense.tick and motion.ticks in self._durations:
+        elif is_move and motion.end_tick > sense.tick and motion.ticks in self._durations:
             begin_tick = motion.end_tick - motion.ticks
             self.begin((0, motion.origin, sense.hold_cell), begin_tick, motion.ticks)
         else:
@@ -179,7 +182,7 @@ class TrackingDriver:
             window = reference.window(tick)
             gaps = self._stop_lines.limit(gaps, window.states, sense.measured)
         result = None
-        if self._shortcut and gaps is NO_GAPS and tick >= reference.end_tick:
+        if self._shortcut and gaps is NO_GAPS and tick >= reference.rest_tick:
             goal = cell_state(self._lattice, self._goal, sense.t_s)
             result = self._tracker.rest(commanded, goal)
         if result is None:

@@ -6,6 +6,8 @@ run into the vehicle ahead, it is replaced by a yielding path (`yield_behind`).
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from attrs import define
 from numpy.typing import NDArray
@@ -208,7 +210,8 @@ def yield_behind(
     s, v = commanded[0], max(commanded[1], 0.0)
     decel = -np.inf
     if gaps.latest is not None:
-        first = min(round(_REACT_S / tick_s), len(jerks))
+        # Rounded down: `latest` may be infinite at all later ticks.
+        first = min(max(math.floor(_REACT_S / tick_s + 1e-9), 1), len(jerks))
         t = tick_s * np.arange(first, len(states))
         needed = 2.0 * (s + v * t - gaps.latest[first:] + _BUFFER_M) / (t * t)
         decel = float(needed.max())

@@ -53,8 +53,9 @@ def comfortable_steps(start_s: float, end_s: float, scenario: Scenario) -> int:
     """Return how many steps of comfortable length, or of a given T_F, fit between two times."""
     shortest_s, longest_s = scenario.timing.cycles_s
     if shortest_s == longest_s:
-        return int((end_s - start_s) / longest_s)
-    return max(1, int((end_s - start_s - RESERVE_S) / scenario.timing.comfortable_cycle_s))
+        return int((end_s - start_s) / longest_s + 1e-6)
+    free_s = end_s - start_s - RESERVE_S
+    return max(1, int(free_s / scenario.timing.comfortable_cycle_s + 1e-6))
 
 
 def paced(

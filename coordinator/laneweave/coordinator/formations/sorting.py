@@ -305,14 +305,18 @@ def sort_lanes(
         best: PlanResponse | None = None
         for request in plan_requests(task, exempt):
             left_s, limit = ends_s - clock(), request.max_steps
-            if best is not None and (left_s <= MIN_DEADLINE_S or _steps(best) <= (limit or 0)):
+            if best is not None and (
+                left_s <= MIN_DEADLINE_S
+                or (limit is not None and (not best.paths or _steps(best) <= limit))
+            ):
                 break
             nodes = max_nodes if limit is None else math.ceil(NODES_SHARE * max_nodes)
             asked = evolve(request, deadline_s=max(left_s, MIN_DEADLINE_S))
             response = make_plan(asked, max_nodes=nodes)
-            if best is None or _steps(response) < _steps(best):
+            timed_out = limit is None and response.status == "timeout"
+            if best is None or _steps(response) < _steps(best) or (timed_out and not best.paths):
                 best = response
-            if _steps(best) <= task.steps or (limit is None and not response.paths):
+            if timed_out or _steps(best) <= task.steps:
                 break
         if best is not None and best.status != "infeasible":
             break

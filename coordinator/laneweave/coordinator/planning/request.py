@@ -37,7 +37,11 @@ from laneweave.protocol.errors import (
 )
 from laneweave.protocol.lattice import Cell, Mode, displacements
 from laneweave.protocol.names import NAME_PATTERN, NAME_RULE
-from laneweave.protocol.scenario.formation_table import CONFLICT_KINDS, DEFAULT_CONFLICTS
+from laneweave.protocol.scenario.formation_table import (
+    CONFLICT_KINDS,
+    DEFAULT_CONFLICTS,
+    MAX_TARGETS,
+)
 from laneweave.protocol.structuring import PLAIN_TYPES, json_form, structure, without
 
 REQUEST_SCHEMA: Final = "laneweave.plan.request/1"
@@ -46,7 +50,6 @@ DEFAULT_DEADLINE_S: Final = 4.0
 MAX_COLUMNS: Final = 1000
 MAX_LANES: Final = 16
 MAX_VEHICLES: Final = 200
-MAX_TARGETS: Final = 400
 MAX_ID_LENGTH: Final = 100
 MAX_DEADLINE_S: Final = 3600.0
 MAX_STEPS: Final = 10_000

@@ -27,8 +27,9 @@ _OPTIONAL: Final = ("solver", "targets", "waited_ms")
 class PlanResponse:
     """A plan, or the reason why there is none.
 
-    status: `optimal`: proven, among plans of any length; `feasible`: the budget was spent before
-        the proof; `infeasible`: proven; `timeout`: no plan was found in time.
+    status: `optimal`: proven, among plans of any length, or of at most `max_steps` steps;
+        `feasible`: the budget was spent before the proof; `infeasible`: proven; `timeout`: no plan
+        was found in time.
     cost, steps: None without a plan. lower_bound: proven lower bound; None if infeasible.
     assignment: per vehicle, the index of its target; empty without a plan.
     paths: per vehicle, its cells at all `steps` + 1 time points; empty without a plan.

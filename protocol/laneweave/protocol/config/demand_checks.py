@@ -10,7 +10,7 @@ import attrs
 from laneweave.protocol.config.rules import compare, require
 from laneweave.protocol.road_layout import ANY_LANE, END_OF_ROAD
 from laneweave.protocol.scenario.fields import Scenario
-from laneweave.protocol.scenario.formation_table import formation_columns
+from laneweave.protocol.scenario.formation_table import MAX_TARGETS, formation_columns
 from laneweave.protocol.scenario.road_tables import EntryPoint
 from laneweave.protocol.scenario.traffic_flow import Inflow
 from laneweave.protocol.vehicle.re_entry import re_entry
@@ -91,6 +91,16 @@ def _check_lane_volumes(scenario: Scenario) -> None:
         if points[number].entrance not in ramps and demand.arrival_shares:
             allowed += f" vehicles per hour in each lane; lane {number} has {volume:g}"
         require(volume <= most * (1.0 + 1e-9), name, value, f"{allowed} ({because})")
+
+
+def check_joined_cells(scenario: Scenario) -> None:
+    """Check that the planner takes all cells of joined formations as targets."""
+    formation = scenario.formation
+    if formation.traits.has_formations:
+        cells = formation.max_length * scenario.road.lanes
+        most = MAX_TARGETS // cells
+        allowed = f"at most {most}, for at most {MAX_TARGETS} cells, {cells} in each formation"
+        require(formation.max_joined <= most, "formation.max_joined", formation.max_joined, allowed)
 
 
 def check_drawn_capacity(scenario: Scenario) -> None:

@@ -28,6 +28,7 @@ _CHECKS = (
         road_checks.check_entrances,
         road_checks.check_dead_ends,
         road_checks.check_exits,
+        demand_checks.check_joined_cells,
         demand_checks.check_drawn_capacity,
         demand_checks.check_destinations,
         motion_checks.check_structures,

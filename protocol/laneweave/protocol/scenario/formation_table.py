@@ -28,6 +28,8 @@ DEFAULT_CONFLICTS: Mapping[int, tuple[str, ...]] = MappingProxyType(
     {1: BASE_CONFLICTS, 2: ("geometric",)}
 )
 """Conflict kinds that planners avoid by default, by mode; formations also avoid `closing`."""
+MAX_TARGETS = 400
+"""Maximum number of cells that a plan request offers as targets."""
 CONFLICT_KINDS = (
     "node",
     "edge",

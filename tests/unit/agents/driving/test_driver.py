@@ -168,6 +168,15 @@ def test_a_motion_that_is_over_or_of_an_impossible_duration_is_taken_over_as_a_h
     assert drive.motion == CurrentMotion(MOVE[2])
 
 
+@pytest.mark.parametrize("origin", [(40, 1), (-2, 3)])
+def test_a_motion_that_does_not_lead_to_a_neighbouring_cell_is_taken_over_as_a_hold(
+    origin: Cell,
+) -> None:
+    made, felt = TrackingDriver(SCENARIO, SCENARIO.vehicle), sense(25, MOVE[2])
+    made.take_over(replace(felt, motion=CurrentMotion(origin, 48, MOVE_TICKS)))
+    assert made.drive(felt, moving=False).motion == CurrentMotion(MOVE[2])
+
+
 # --- the end of a motion ----------------------------------------------------------------------
 
 

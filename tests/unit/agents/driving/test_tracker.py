@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 from laneweave.agents.driving.qp_solver import QuadraticProgram
 from laneweave.agents.driving.reference import Reference, Window
 from laneweave.agents.driving.stopping_points import StoppingPoints
+from laneweave.agents.driving.surroundings import Surroundings
 from laneweave.agents.driving.tracker import Tracker, TrackResult
 from laneweave.agents.driving.tracking_problem import (
     NO_GAPS,
@@ -27,11 +28,13 @@ from laneweave.agents.driving.tracking_problem import (
     TrackingProgram,
     shared_program,
 )
+from laneweave.protocol.config.scenario_files import parse_scenario
 from laneweave.protocol.lattice import Cell
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.vehicle.motion import Jerk, State, cell_state, integrate, limited_jerk
 from laneweave.protocol.wire.messages import Neighbour
 from support.examples import examples
+from support.states import sense_in
 from support.tables import for_each
 
 SCENARIO = Scenario()
@@ -40,6 +43,7 @@ LIMITS = SCENARIO.vehicle
 LATTICE = SCENARIO.lattice
 TICK_S = SCENARIO.runtime.tick_s
 N = SCENARIO.timing.horizon_ticks
+HOME: Cell = (0, 1)
 MOVES = [(dx, dy) for dx in (-1, 0, 1) for dy in (-1, 0, 1) if (dx, dy) != (0, 0)]
 TIMES_S = TICK_S * np.arange(N + 1)
 
@@ -274,6 +278,30 @@ def test_a_vehicle_cutting_in_opens_the_gap_again() -> None:
     assert gaps[40] >= SCENARIO.tracking.min_gap_m - 0.1
     assert gaps[-1] <= SCENARIO.tracking.min_gap_m + 1.0
     assert max(excess(state, first_jerk(result)) for state, result in log) <= 1e-3
+
+
+@for_each("tick_s", [0.06, 0.1, 0.13, 0.15, 0.2, 0.35])
+def test_the_gap_behind_a_vehicle_that_is_too_near_is_opened_again(tick_s: float) -> None:
+    """Also where a second, for which neighbours are predicted, is no whole number of ticks."""
+    gap_m, v_f, slot_s = 1.5, LATTICE.speed_mps, 60 * tick_s if tick_s < 0.1 else 40 * tick_s
+    scenario = parse_scenario(
+        {
+            "runtime": {"tick_s": tick_s},
+            "braking": {"reaction_s": tick_s},
+            "formation": {"cycle_s": slot_s, "move_s": slot_s - 2 * tick_s},
+        }
+    )
+    surroundings, tracker = Surroundings(scenario, LIMITS), Tracker(scenario, LIMITS)
+    reference, state = Reference.hold(scenario, LIMITS, HOME), cell_state(LATTICE, HOME, 0.0)
+    for tick in range(round(4.0 / tick_s)):
+        near = (Neighbour(HOME[1], gap_m, v_f),)
+        felt = sense_in(HOME, tick, measured=state, ahead=near)
+        gaps = surroundings.gaps(felt, state, HOME[1])
+        result = tracker.solve(state, reference.window(tick), gaps)
+        moved = integrate(state, (result.jerk[0, 0], result.jerk[0, 1]), tick_s)
+        gap_m += v_f * tick_s - (moved[0] - state[0])
+        state = moved
+    assert gap_m > 3.0
 
 
 @pytest.mark.parametrize("distance", [1e3, 1e9, math.inf])

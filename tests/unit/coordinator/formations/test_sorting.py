@@ -256,6 +256,18 @@ def test_all_placements_share_one_deadline() -> None:
     assert asked == [5.0, 3.0, 1.0]
 
 
+def test_a_placement_that_cannot_be_reached_is_followed_by_others() -> None:
+    """The nearest cell of the vehicle's lane is walled in; farther ones are not."""
+    cells = {A: (-3, 0), B: (-3, 1), C: (-2, 2)}
+    order = task(cells, {A: 2, B: 1, C: 2}, B, C)
+    first, second, *_ = plan_requests(order)
+    assert plan(first).status == "infeasible"
+    assert plan(second).status == "optimal"
+    sorting = sort(order)
+    assert sorting.out_of_reach == ()
+    assert ends(order, sorting)[A][1] == 2
+
+
 @pytest.mark.parametrize("steps", [-2, 0, 1])
 def test_without_time_for_a_step_the_shortest_of_some_plans_is_taken(steps: int) -> None:
     """`SortingTask.steps` counts from the front of the formation, so it may be 0 or negative."""

@@ -70,6 +70,19 @@ def test_costs_are_those_of_the_plan(seed: int) -> None:
     )
 
 
+def test_the_joint_search_may_prove_that_there_is_no_plan() -> None:
+    """Of four assignments only the first one was tried."""
+    vehicles = (
+        VehicleRequest("a", (0, 0), eligible=(2, 3)),
+        VehicleRequest("b", (1, 0), eligible=(0, 1)),
+    )
+    kinds, targets = ("node", "edge", "special-1"), ((1, 0), (2, 0), (3, 0), (4, 0))
+    told = explain(PlanRequest(Grid(5, 1), 1, kinds, vehicles, targets, 20.0))
+    assert told.optimal
+    assert told.next_cost is not None
+    assert told.stop_reason == "joint search: there is no path set, C'* = infinite"
+
+
 def test_a_run_without_a_plan_is_explained() -> None:
     vehicles = (
         VehicleRequest("a", (0, 0), eligible=(1,)),

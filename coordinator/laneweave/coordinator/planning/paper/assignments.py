@@ -104,6 +104,7 @@ def matrices(
     relative distance, or impossible. Both only improve the lower bound: C takes the longer
     distance, and P drops targets that cannot be reached, or not within the permitted steps.
     """
+    budget.check_time()
     starts = [vehicle.cell for vehicle in request.vehicles]
     costs = cost_matrix(starts, request.targets, weights)
     allowed = preference_matrix(request.choices(), len(request.targets))

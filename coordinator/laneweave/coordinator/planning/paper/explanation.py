@@ -99,6 +99,8 @@ class Explanation:
             return f"C_{k + 1} = {self.next_cost:g} >= C'* = {best}"
         if self.best_cost <= self.joint_bound and not math.isinf(self.best_cost):
             return f"joint search: no path set costs less than C'* = {best}"
+        if math.isinf(self.joint_bound):
+            return f"joint search: there is no path set, C'* = {best}"
         return f"there is no further assignment, C'* = {best}"
 
 

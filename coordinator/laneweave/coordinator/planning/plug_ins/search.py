@@ -8,6 +8,7 @@ from typing import Final
 import structlog
 
 from laneweave.coordinator.planning.budget import Budget, BudgetSpentError
+from laneweave.coordinator.planning.path_map import final_arrival
 from laneweave.coordinator.planning.plan_validator import problems_of_paths
 from laneweave.coordinator.planning.plug_ins.registry import (
     PlainPaths,
@@ -95,18 +96,10 @@ def _solution(
         raise PlannerFailedError(f"an invalid plan: {shown}{more}")
     number = problem.table.number
     moves = tuple(
-        tuple(number((path[step], path[step + 1])) for step in range(_arrival(path)))
+        tuple(number((path[step], path[step + 1])) for step in range(final_arrival(path)))
         for path in padded
     )
     return Solution(assignment, moves)
-
-
-def _arrival(path: Sequence[Cell]) -> int:
-    """Return the number of steps until the final arrival."""
-    steps = len(path) - 1
-    while steps and path[steps] == path[steps - 1]:
-        steps -= 1
-    return steps
 
 
 def _lower_bound(request: PlanRequest) -> int:

@@ -2,7 +2,7 @@
 
 Every vehicle may request one move for the next slot; without a request it holds. A request is
 granted if the road and the vehicle's type allow the move, and if it conflicts with no other
-vehicle. Of two requests that conflict with each other, that of the vehicle farther ahead is
+vehicle. Of two requests that conflict only with each other, that of the vehicle farther ahead is
 granted; with equal columns, that in the lower lane. A refused vehicle holds. After the slot all
 paths hold their cells, since no later requests are known.
 """
@@ -97,7 +97,7 @@ def _path(road: StreamRoad, slot: int, cell: Cell, move: Cell) -> CellPath:
 
 
 def _refuse_conflicts(road: StreamRoad, moves: dict[Cell, Cell]) -> None:
-    """Replace conflicting moves by waiting, until no move conflicts with another vehicle.
+    """Replace as few moves by waiting as leave no move that conflicts with another vehicle.
 
     Args:
         road: defines conflicts.
@@ -107,16 +107,25 @@ def _refuse_conflicts(road: StreamRoad, moves: dict[Cell, Cell]) -> None:
         step: conflicting_displacements(road.mode, road.model, step)
         for step in displacements(road.mode)
     }
+    wanted = moves.copy()
+
+    def conflicts(cell: Cell, move: Cell) -> bool:
+        return any(
+            moves.get((cell[0] + column, cell[1] + lane)) in conflicting
+            for (column, lane), conflicting in near[move].items()
+        )
+
+    # From the rear, so that the vehicle ahead keeps its move.
+    from_rear = sorted(moves, key=lambda cell: (cell[0], -cell[1]))
     # A refused vehicle waits, which may conflict with moves that did not conflict with its own.
     refused = True
     while refused:
         refused = False
-        # From the rear, so that the vehicle ahead keeps its move.
-        for cell in sorted(moves, key=lambda cell: (cell[0], -cell[1])):
-            move = moves[cell]
-            if move != WAIT and any(
-                moves.get((cell[0] + column, cell[1] + lane)) in conflicting
-                for (column, lane), conflicting in near[move].items()
-            ):
+        for cell in from_rear:
+            if moves[cell] != WAIT and conflicts(cell, moves[cell]):
                 moves[cell] = WAIT
                 refused = True
+    # Some were refused because of others that were refused later.
+    for cell in reversed(from_rear):
+        if wanted[cell] != moves[cell] and not conflicts(cell, wanted[cell]):
+            moves[cell] = wanted[cell]

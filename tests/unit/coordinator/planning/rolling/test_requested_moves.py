@@ -52,6 +52,11 @@ def test_of_two_requests_for_one_cell_that_of_the_vehicle_ahead_is_granted() -> 
     assert grant({(40, 0): LEFT, (40, 2): RIGHT}) == {(40, 0)}
 
 
+def test_a_refused_request_conflicts_with_no_other() -> None:
+    """The one ahead cannot be granted, so it keeps no other from moving."""
+    assert grant({(40, 1): FORWARD, (42, 1): BACK, (43, 1): BACK}) == {(42, 1)}
+
+
 def test_neighbours_do_not_swap() -> None:
     assert grant({(40, 0): LEFT, (40, 1): RIGHT}) == set()
     assert grant({(40, 1): FORWARD, (41, 1): BACK}) == set()
