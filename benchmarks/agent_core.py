@@ -44,7 +44,7 @@ from laneweave.protocol.vehicle.motion import State
 from laneweave.protocol.wire.codec import decode, encode
 from laneweave.protocol.wire.messages import Ballot, Command, Name, Plan, Prepare, Sense
 from laneweave.protocol.wire.topics import PLAN, PREPARE, SENSE, Keys, Quality, matches_any
-from laneweave.sim_bridge.bodies.overlaps_and_gaps import OtherBody, Pose, pose_of
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import OtherBody, Pose, Size, pose_of
 from laneweave.sim_bridge.recording.run_record import RunRecord
 from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.road.entry import Admission
@@ -138,6 +138,9 @@ class BodyStore:
         """Add a vehicle."""
         del vehicle_type
         self.at[vehicle] = state
+
+    def resize(self, vehicle: str, size: Size) -> None:
+        """Do nothing."""
 
     def step(self) -> None:
         """Do nothing."""

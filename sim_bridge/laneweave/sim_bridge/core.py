@@ -38,7 +38,6 @@ from laneweave.protocol.runtime.node import (
 from laneweave.protocol.scenario.deployment_fields import Runtime
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.summary import Ending
-from laneweave.protocol.vehicle.motion import State
 from laneweave.protocol.wire.events import AGENT_MISSING
 from laneweave.protocol.wire.messages import Command, Heartbeat, Name, Plan, Prepare
 from laneweave.protocol.wire.process_messages import LogEvent, Report, RoadStatus
@@ -56,6 +55,7 @@ from laneweave.sim_bridge.recording.record_interface import Record
 from laneweave.sim_bridge.road.demand import Arrival
 from laneweave.sim_bridge.road.demand_queue import NO_OUTSIDE_TRAFFIC, OutsideTraffic
 from laneweave.sim_bridge.road.obstacles import Breakdown
+from laneweave.sim_bridge.road.passing_vehicles import PassingVehicles
 from laneweave.sim_bridge.road.road_desk import RoadDesk
 from laneweave.sim_bridge.road.roadside import Roadside
 from laneweave.sim_bridge.road.vehicle import RoadVehicle
@@ -408,7 +408,7 @@ class BridgeCore:
         road.step()
         obstacles = self._roadside.obstacles
         closed, passing = obstacles.without_vehicles(road.t_s), obstacles.passing
-        self._show_passing(passing.states)
+        self._show_passing(passing)
         show_bodies(
             self._world, road.vehicles, self._scenario, self._record, road.t_s, closed, passing
         )
@@ -428,12 +428,14 @@ class BridgeCore:
         self._until_s = self._pace.next_s(now_s, answering=answering)
         self.phase = TickPhase.PACE
 
-    def _show_passing(self, states: Mapping[str, State]) -> None:
+    def _show_passing(self, passing: PassingVehicles) -> None:
         """Add vehicles of other systems to the world, and remove those that have left."""
+        states = passing.states
         for name in self._passing - states.keys():
             self._world.remove(name)
         for name in states.keys() - self._passing:
             self._world.add(name, states[name])
+            self._world.resize(name, passing.sizes[name])
         self._passing = {*states}
 
     def _is_over(self) -> bool:

@@ -15,6 +15,7 @@ from laneweave.sim_bridge.bodies.overlaps_and_gaps import (
     ExactNeighbours,
     OtherBody,
     Pose,
+    Size,
 )
 from laneweave.sim_bridge.recording.record_interface import Record
 from laneweave.sim_bridge.road.passing_vehicles import PassingVehicles
@@ -30,6 +31,9 @@ class World(Protocol):
 
     def add(self, vehicle: str, state: State, vehicle_type: str = CAR) -> None:
         """Add a vehicle to the road."""
+
+    def resize(self, vehicle: str, size: Size) -> None:
+        """Set length and width [m] of a vehicle that has no type."""
 
     def place(self, vehicle: str, state: State) -> None:
         """Set the state of a vehicle at the end of the next step."""

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from laneweave.protocol.vehicle.motion import State
 from laneweave.protocol.wire.messages import CAR
-from laneweave.sim_bridge.bodies.overlaps_and_gaps import OtherBody, Pose, pose_of
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import OtherBody, Pose, Size, pose_of
 
 
 class BodiesWorld:
@@ -32,6 +32,9 @@ class BodiesWorld:
             raise ValueError(f"{vehicle} is already on the road")
         self._check(vehicle, state)
         self.states[vehicle] = state
+
+    def resize(self, vehicle: str, size: Size) -> None:
+        """Do nothing: sizes do not matter here."""
 
     def place(self, vehicle: str, state: State) -> None:
         """Set the state of a vehicle at the end of the next step.

@@ -180,13 +180,13 @@ class Bodies:
         tick_m = scenario.vehicle.max_speed_mps * scenario.runtime.tick_s
         closures = scenario.geometry.closed_to_bodies(scenario.types.longest_body_m, tick_m)
         parts: list[Closure | TemporaryClosure] = [*closures, *closed]
-        for number, part in enumerate(parts):
+        for part in parts:
             low_m = part.lane * lane_m + _TOUCH_M
             high_m = low_m + lane_m - 2.0 * _TOUCH_M
             for name, (rear, front, low, high) in zip(self._names, self._extents, strict=True):
                 along = rear < part.to_m - _TOUCH_M and front > part.from_m + _TOUCH_M
                 if along and low < high_m and high > low_m:
-                    pairs.append((f"closure-{number}", name))
+                    pairs.append((f"closure-{part.lane}-{part.from_m:g}", name))
         return pairs
 
     def min_gaps(self) -> MinGaps:

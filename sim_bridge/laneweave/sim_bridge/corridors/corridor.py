@@ -197,8 +197,15 @@ def lanes_by_edge(network: Network, last: CorridorEdge) -> dict[str, list[int]]:
     return found
 
 
+_NO_ROUTES: Mapping[str, Collection[str]] = MappingProxyType({})
+
+
 def corridor_of(
-    network: Network, first: str, last: str, departing: Collection[str] = ()
+    network: Network,
+    first: str,
+    last: str,
+    departing: Collection[str] = (),
+    continuing: Mapping[str, Collection[str]] = _NO_ROUTES,
 ) -> Corridor:
     """Return the corridor from one edge to another.
 
@@ -208,6 +215,8 @@ def corridor_of(
         last: name of its last edge.
         departing: edges on which vehicles depart. A ramp begins with the last one of them, since
             vehicles must not depart between vehicles that have been taken over.
+        continuing: edges to which vehicles drive from each edge; empty where their routes end.
+            A ramp begins behind edges from which some do not come to the corridor.
 
     Raises:
         BadInputError: an edge does not exist, no way leads from the first to the last, or vehicles
@@ -222,7 +231,7 @@ def corridor_of(
             raise BadInputError(OPTION, edge.name, "edges with a lane for cars")
     for before, after in pairwise(way):
         _check_right_of_way(network, before, after)
-    return _Derivation(network, way, departing).corridor()
+    return _Derivation(network, way, departing, continuing).corridor()
 
 
 def _way(network: Network, first: str, last: str) -> tuple[Edge, ...]:
@@ -302,9 +311,16 @@ def _nearest_lanes(lanes: Sequence[int], open_lanes: Collection[int]) -> tuple[i
 class _Derivation:
     """The derivation of one corridor."""
 
-    def __init__(self, network: Network, way: tuple[Edge, ...], departing: Collection[str]) -> None:
+    def __init__(
+        self,
+        network: Network,
+        way: tuple[Edge, ...],
+        departing: Collection[str],
+        continuing: Mapping[str, Collection[str]],
+    ) -> None:
         self._network = network
         self._departing = departing
+        self._continuing = continuing
         self._names = {edge.name for edge in way}
         self._limit_mps = min(lane.speed_mps for edge in way for lane in edge.car_lanes)
         self._links = [through_links(network, *pair) for pair in pairwise(way)]
@@ -438,8 +454,8 @@ class _Derivation:
         """Return length, lowest speed limit and links of the way on which vehicles come to a link.
 
         It begins where others join, where vehicles depart or have to give way, or where it has
-        more lanes. Edges that SUMO's vehicles use for another way, or from which not every lane
-        leads on, are not part of it.
+        more lanes. Edges from which vehicles drive elsewhere, or from which not every lane leads
+        on, are not part of it.
         """
         length_m, speed_mps, path = 0.0, link.origin.speed_mps, list[Link]()
         seen = set[str]()
@@ -447,7 +463,10 @@ class _Derivation:
             lane = link.origin
             lanes = self._network.edges[lane.edge].car_lanes
             ways = [{on.target.edge for on in self._network.links_from(one)} for one in lanes]
-            if any(edges != {link.target.edge} for edges in ways):
+            onwards = {link.target.edge}
+            if not onwards.issuperset(self._continuing.get(lane.edge, ())) or not all(
+                onwards <= edges for edges in ways
+            ):
                 break
             seen.add(lane.name)
             path.append(link)

@@ -361,7 +361,7 @@ def _motion(tables: Tables, corridor: Corridor, speed_mps: float) -> dict[str, A
         if not ramp.path:
             allowed = (
                 "on-ramps whose vehicles have priority where their acceleration lanes begin, and "
-                "whose edges lead nowhere else"
+                "on whose edges vehicles drive only to the corridor"
             )
             raise BadInputError(f"{OPTION} {corridor.name}, on-ramp", ramp.edge, allowed)
         raise BadInputError(

@@ -133,7 +133,8 @@ def read_corridor(file: Path, name: str, window: TimeWindow = WHOLE, seed: int =
 
 def corridor_in(simulation: SumoSimulation, first: str, last: str) -> SumoCorridor:
     """Return the corridor from one edge to another, with its vehicles; see `corridor_of`."""
-    corridor = corridor_of(simulation.network, first, last, simulation.departing)
+    departing, continuing = simulation.departing, simulation.continuing
+    corridor = corridor_of(simulation.network, first, last, departing, continuing)
     passes, left_out = list[Pass](), dict[str, str]()
     for vehicle in simulation.vehicles:
         found = _pass_of(vehicle, corridor)

@@ -22,11 +22,25 @@ from laneweave.sim_bridge.recording.statistics import percentiles_of
 def line_of(t_s: float, kind: str, data: Mapping[str, object]) -> bytes:
     """Return the line of an event.
 
-    Values that JSON does not support are written as text; keys `t_s` and `kind` in the data are
-    ignored.
+    Values and keys that JSON does not support are written as text; keys `t_s` and `kind` in the
+    data are ignored.
     """
     own: dict[str, object] = {"t_s": t_s, "kind": kind}
-    return (json.dumps({**own, **data, **own}, default=str) + "\n").encode()
+    line: object = {**own, **data, **own}
+    try:
+        text = json.dumps(line, default=str, allow_nan=False)
+    except (TypeError, ValueError):
+        text = json.dumps(_supported(line), default=str)
+    return f"{text}\n".encode()
+
+
+def _supported(value: object) -> object:
+    """Return a value with text for keys and numbers that JSON does not support."""
+    if isinstance(value, Mapping):
+        return {str(key): _supported(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_supported(item) for item in value]
+    return str(value) if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def append_event(path: Path, t_s: float, kind: str, data: Mapping[str, object]) -> None:

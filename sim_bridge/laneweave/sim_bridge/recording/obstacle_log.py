@@ -17,14 +17,16 @@ class ObstacleLog:
     """The closed parts of a run."""
 
     _figures: list[ObstacleFigures] = field(factory=list)
-    _active: dict[tuple[int, float, Name | None], int] = field(factory=dict)
-    """Index in `_figures` of each part that is closed now, by lane, beginning and vehicle."""
+    _active: dict[tuple[int, float, Name | None, float], int] = field(factory=dict)
+    """Index in `_figures` of each part that is closed now, by lane, beginning, vehicle and time."""
     _waits: dict[Name, tuple[int, float]] = field(factory=dict)
     """Index of the part at which each vehicle waits, and road time since which it does."""
+    _stopped: set[tuple[Name, int]] = field(factory=set)
+    """Vehicles that have stopped, with the index of the part."""
 
     def on_obstacle(self, t_s: float, kind: str, obstacle: Obstacle) -> None:
         """Note that a part is closed, is longer or shorter than before, or is open again."""
-        place = obstacle.lane, obstacle.from_m, obstacle.vehicle
+        place = obstacle.lane, obstacle.from_m, obstacle.vehicle, obstacle.since_s
         number = self._active.setdefault(place, len(self._figures))
         if number == len(self._figures):
             self._figures.append(
@@ -49,11 +51,19 @@ class ObstacleLog:
         """Note that a vehicle has no cell any more, or has one again."""
         if kind == LEFT_LATTICE:
             number = self._ahead(lane, s_m)
-            has_broken_down = any(vehicle == own for _, _, own in self._active)
+            has_broken_down = any(vehicle == own for _, _, own, _ in self._active)
             if number is not None and not has_broken_down:
+                # A vehicle that drives back into a cell may stop once more before it has one.
+                self._end_wait(vehicle, t_s)
                 self._waits[vehicle] = number, t_s
-                self._change(number, stopped=self._figures[number].stopped + 1)
-        elif kind == ENTERED_LATTICE and vehicle in self._waits:
+                if (vehicle, number) not in self._stopped:
+                    self._stopped.add((vehicle, number))
+                    self._change(number, stopped=self._figures[number].stopped + 1)
+        elif kind == ENTERED_LATTICE:
+            self._end_wait(vehicle, t_s)
+
+    def _end_wait(self, vehicle: Name, t_s: float) -> None:
+        if vehicle in self._waits:
             number, since_s = self._waits.pop(vehicle)
             waited_s = round(self._figures[number].waited_s + t_s - since_s, 6)
             self._change(number, waited_s=waited_s)

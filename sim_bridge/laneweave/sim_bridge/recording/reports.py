@@ -16,11 +16,12 @@ from laneweave.protocol.wire.process_messages import Report
 from laneweave.sim_bridge.recording.statistics import finite
 
 MAX_SENDERS = 256
-"""Number of senders whose newest reports are stored. An older report is final: by then, the vehicle
-of its agent has left the road, and coordinators report every 2 s."""
+"""Number of agents, and of processes, whose newest reports are stored. An older report is final: by
+then, the vehicle of the agent has left the road. Those of others are stored until the end."""
 MAX_SOLVE_MS = 1000.0
 """Longer solves count as this long."""
 _BINS_PER_MS = 1000
+_AGENT = Name("agent")
 _RADIO = ("sidelink", "sidelink_lost", "cellular", "cellular_lost")
 _SUMMED = ("solves", "unusable", "osqp_solves", *_RADIO)
 _OF_PROCESS = ("published", "rejected")
@@ -78,6 +79,8 @@ class ReportTotals:
     """Sums over all other senders and processes."""
     _processes: dict[Name, Counter[str]] = field(factory=dict)
     """Counters of the processes of these senders."""
+    _others: set[Name] = field(factory=set)
+    """Processes that are no agents."""
     _solve_times: SolveTimes = field(factory=SolveTimes)
     """Durations in reports that are final."""
 
@@ -88,10 +91,14 @@ class ReportTotals:
         self._newest[sender] = report
         counters = Counter({name: getattr(report, name) for name in _OF_PROCESS})
         self._processes[report.process] = counters | self._processes.pop(report.process, counters)
-        if len(self._newest) > MAX_SENDERS:
-            self._finish(self._newest.pop(next(iter(self._newest))))
-        if len(self._processes) > MAX_SENDERS:
-            self._final += self._processes.pop(next(iter(self._processes)))
+        if report.role != _AGENT:
+            self._others.add(report.process)
+        agents = (one for one in self._newest if one[0] == _AGENT)
+        if len(self._newest) > MAX_SENDERS and (oldest := next(agents, None)):
+            self._finish(self._newest.pop(oldest))
+        processes = (one for one in self._processes if one not in self._others)
+        if len(self._processes) > MAX_SENDERS and (first := next(processes, None)):
+            self._final += self._processes.pop(first)
 
     def total(self, counter: str) -> int:
         """Return the sum of a counter over all senders, or over all processes."""

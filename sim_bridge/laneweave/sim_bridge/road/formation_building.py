@@ -252,13 +252,13 @@ class GrowingFormations:
             if begun is not None and not begun.front - self.max_columns < column <= begun.front:
                 return False
             shape = self._opened(column)
-            shape.rear = min(shape.rear, column)
             columns = self.shortest_length
         else:
             columns = len(shape.columns)
         count = shape.vehicles.count + 1
         if self._length_for(count) > columns or not shape.vehicles.fits(preferred_lane, columns):
             return False
+        shape.rear = min(shape.rear, column)
         shape.vehicles.add(preferred_lane)
         shape.from_ramps += 1
         return True

@@ -116,6 +116,7 @@ class SumoProcess:
             reason = " ".join(str(error).split())
             raise SumoFailedError(f"SUMO has ended ({reason}); its messages say why") from error
         if self._gui is not None and not self._gui.show(self.vehicle, self.vehicle.getIDList()):
+            self._gui.close()
             self._gui = None
 
     def close(self) -> None:
@@ -190,7 +191,8 @@ class SumoGui:
         if program == "sumo-gui":
             command += ["--start", "true", "--quit-on-end", "true", "--delay", "0"]
         self._lost = (traci.exceptions.FatalTraCIError, OSError)
-        self._refused = traci.exceptions.TraCIException
+        # Once libsumo is loaded, `traci.exceptions` has its exception instead.
+        self._refused = traci.connection.TraCIException
         try:
             traci.start(command, label=_LABEL)
             self._gui: Any = traci.getConnection(_LABEL)

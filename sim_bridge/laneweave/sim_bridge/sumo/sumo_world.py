@@ -21,7 +21,7 @@ from laneweave.protocol.scenario.road_tables import MAIN_ENTRANCE
 from laneweave.protocol.vehicle.motion import State
 from laneweave.protocol.wire.messages import CAR
 from laneweave.sim_bridge.bodies.bodies_world import BodiesWorld
-from laneweave.sim_bridge.bodies.overlaps_and_gaps import Pose, pose_of
+from laneweave.sim_bridge.bodies.overlaps_and_gaps import Pose, Size, pose_of
 from laneweave.sim_bridge.sumo.road_edges import ROAD, margin_m, route_name
 from laneweave.sim_bridge.sumo.session import SumoSession
 
@@ -56,6 +56,11 @@ class SumoWorld(SumoSession, BodiesWorld):
         api.setSpeedMode(vehicle, 0)
         api.setLaneChangeMode(vehicle, 0)
         self._move(vehicle, state)
+
+    def resize(self, vehicle: str, size: Size) -> None:
+        """Set length and width [m] of a vehicle; its heading must stay 0."""
+        self.vehicle.setLength(vehicle, size[0])
+        self.vehicle.setWidth(vehicle, size[1])
 
     def place(self, vehicle: str, state: State) -> None:
         """Set the state of a vehicle at the end of the next step.

@@ -14,6 +14,8 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+from laneweave.protocol.road_layout import TemporaryClosure
+from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.wire.messages import Neighbour
 from laneweave.sim_bridge.bodies import overlaps_and_gaps as overlap
 from laneweave.sim_bridge.bodies.overlaps_and_gaps import (
@@ -206,6 +208,13 @@ def test_bodies_of_different_sizes_touch_where_they_do() -> None:
     assert pairs(car, (20.0, 1.749 + 2.15, 0.0, 15.0)) == [("t", "v")]
     assert bodies({"v": car, "t": (40.0, 1.75, 0.0, 15.0)}).min_gaps().gap_m == 8.0
     assert bodies({"v": car, "t": (10.0, 1.75, 0.0, 15.0)}).min_gaps().gap_m == 5.0
+
+
+def test_a_closed_part_keeps_its_name_while_others_open() -> None:
+    bodies, scenario = overlap.Bodies({"v1": (510.0, 1.75, 0.0, 0.0)}, 5.0, 1.8), Scenario()
+    left, right = TemporaryClosure(2, 100.0, 200.0), TemporaryClosure(0, 500.0, 600.0)
+    for closed in ((left, right), (right,)):
+        assert bodies.in_closed_lanes(scenario, closed) == [("closure-0-500", "v1")]
 
 
 def test_sensing_sees_how_others_accelerate() -> None:

@@ -189,7 +189,12 @@ def with_way_out(network: Network, edge: str, index: int) -> Network:
 
 @pytest.mark.parametrize(
     ("edge", "index", "path"),
-    [("before", 0, ["on"]), ("before", 1, ["on"]), ("on", 0, []), ("on", 1, [])],
+    [
+        ("before", 0, ["on"]),
+        ("before", 1, ["on"]),
+        ("on", 0, []),
+        ("on", 1, []),
+    ],
 )
 def test_a_ramp_begins_behind_edges_that_lead_elsewhere_too(
     network: Network, edge: str, index: int, path: list[str]
@@ -197,8 +202,17 @@ def test_a_ramp_begins_behind_edges_that_lead_elsewhere_too(
     """SUMO drives other vehicles there."""
     (whole,) = corridor_of(network, "main1", "main5").ramps
     assert [link.origin.edge for link in whole.path] == ["on", "before"]
-    (ramp,) = corridor_of(with_way_out(network, edge, index), "main1", "main5").ramps
+    forked, after = with_way_out(network, edge, index), {"before": "on", "on": "main4"}[edge]
+    (ramp,) = corridor_of(forked, "main1", "main5", (), {edge: {after, "away"}}).ramps
     assert [link.origin.edge for link in ramp.path] == path
+
+
+@pytest.mark.parametrize("ends", [False, True])
+def test_a_ramp_begins_behind_an_edge_on_which_a_route_ends(network: Network, ends: bool) -> None:
+    """Not behind one from which a way leads back that nobody takes, as netconvert adds them."""
+    routes = {"before": {"on", ""} if ends else {"on"}}
+    (ramp,) = corridor_of(with_way_out(network, "before", 0), "main1", "main5", (), routes).ramps
+    assert [link.origin.edge for link in ramp.path] == (["on"] if ends else ["on", "before"])
 
 
 def test_a_ramp_begins_behind_edges_with_lanes_that_end(network: Network) -> None:
@@ -212,8 +226,9 @@ def test_a_ramp_begins_behind_edges_with_lanes_that_end(network: Network) -> Non
 
 def test_a_ramp_whose_last_edge_leads_elsewhere_too_is_refused(interchange: SumoCorridor) -> None:
     network = with_way_out(interchange.simulation.network, "on", 0)
-    with pytest.raises(BadInputError, match="lead nowhere else"):
-        checked(interchange, ramps=corridor_of(network, "main1", "main5").ramps)
+    corridor = corridor_of(network, "main1", "main5", (), {"on": {"main4", "away"}})
+    with pytest.raises(BadInputError, match="only to the corridor"):
+        checked(interchange, ramps=corridor.ramps)
 
 
 def test_vehicles_must_not_have_to_give_way_on_a_corridor(network: Network) -> None:

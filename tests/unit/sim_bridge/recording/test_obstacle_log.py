@@ -37,6 +37,25 @@ def test_a_vehicle_stops_for_the_next_part_ahead() -> None:
     assert stops(log) == [(1, 0.0), (1, 30.0), (0, 0.0)]
 
 
+def test_a_vehicle_that_stops_twice_before_it_has_a_cell_waits_all_the_time() -> None:
+    log = log_of(NEAR)
+    for t_s in (60.0, 90.0):
+        log.on_lane_end(t_s, Name("v1"), 1, LEFT_LATTICE, 590.0)
+    log.on_lane_end(100.0, Name("v1"), 1, ENTERED_LATTICE, 595.0)
+    assert stops(log) == [(1, 40.0)]
+
+
+def test_a_part_may_be_closed_in_the_tick_in_which_another_one_is_opened() -> None:
+    later = Obstacle(1, 600.0, 650.0, since_s=200.0)
+    log = log_of(NEAR, later)
+    log.on_obstacle(200.0, PART_OPENED, NEAR)
+    log.on_obstacle(300.0, PART_OPENED, later)
+    assert [(one.to_m, one.since_s, one.opened_s) for one in log.figures or ()] == [
+        (700.0, 50.0, 200.0),
+        (650.0, 200.0, 300.0),
+    ]
+
+
 def test_beyond_closed_parts_a_passing_vehicle_is_the_cause() -> None:
     log = log_of(NEAR, FAST)
     log.on_lane_end(65.0, Name("v1"), 1, LEFT_LATTICE, 720.0)

@@ -46,6 +46,18 @@ def test_final_reports_count_like_stored_ones(
         assert found == pytest.approx(float(np.percentile(every, percent)), abs=0.0011)
 
 
+def test_reports_of_coordinators_are_never_final(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They report until the end, also if many agents do so between two of their reports."""
+    monkeypatch.setattr(reports_module, "MAX_SENDERS", 8)
+    totals = ReportTotals()
+    totals.add(Report(Name("coordinator"), Name("c1"), Name("c1"), 1000, sidelink=5))
+    for number in range(30):
+        name = Name(f"v{number}")
+        totals.add(Report(Name("agent"), name, name, 1))
+    totals.add(Report(Name("coordinator"), Name("c1"), Name("c1"), 1010, sidelink=6))
+    assert (totals.total("published"), totals.total("sidelink")) == (1040, 6)
+
+
 def test_percentiles_interpolate_as_numpy_does() -> None:
     for values in ([2.0], [1.0, 3.0], [0.0, 0.001, 0.5, 0.5, 7.25], [5.0] * 10):
         times = SolveTimes()

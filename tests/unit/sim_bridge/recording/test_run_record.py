@@ -327,6 +327,9 @@ def test_events_are_written_at_once_and_begin_with_the_time(
     record.event(2.0, "odd", t_s=99, kind="other", more=[1, 2])
     (odd,) = read_events(tmp_path, "odd")
     assert odd == {"t_s": 2.0, "kind": "odd", "role": "bridge", "more": [1, 2]}
+    record.event(3.0, "not finite", figures={(1, 2): [float("nan"), 1.5, float("-inf")]})
+    (last,) = read_events(tmp_path, "not finite")
+    assert last["figures"] == {"(1, 2)": ["nan", 1.5, "-inf"]}
 
 
 def test_the_launcher_adds_events_between_those_of_the_bridge(

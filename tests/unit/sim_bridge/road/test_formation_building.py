@@ -289,6 +289,19 @@ def test_a_formation_keeps_room_for_vehicles_from_a_ramp() -> None:
     assert (closed.first_block, closed.last_block) == (-1, 2)
 
 
+def test_a_refused_vehicle_from_a_ramp_makes_the_open_formation_no_longer() -> None:
+    entered, refused = ((3, 1, 1), (3, 2, 1), (2, 1, 1)), ((1, 0, 1), (0, 0, 1), (-1, 0, 1))
+    closed = []
+    for vehicles in (entered, (*entered, *refused)):
+        entrances = Entrances(3, frozenset({0}), 45.0, 0)
+        builder = GrowingFormations(lattice(3), 6, 7, SPREAD_S, entrances)
+        taken = take(builder, *vehicles)
+        assert taken == [vehicle in entered for vehicle in vehicles]
+        builder.reserve(-1, 1, 10.0)  # completes the open formation
+        closed.append(builder.closed(60.0))
+    assert closed[0] == closed[1]
+
+
 def test_a_vehicle_from_a_ramp_enters_also_if_formations_are_short() -> None:
     builder = GrowingFormations(lattice(2), 1, 1, 1.5, Entrances(1, frozenset({0}), 45.0, 0))
     assert take(builder, (-2, 0, -1)) == [True]

@@ -57,6 +57,30 @@ def test_the_run_goes_on_when_the_window_is_closed(tmp_path: Path) -> None:
         assert world.vehicle.getIDList() == ("a",)
 
 
+def test_a_window_is_closed_once_it_refuses_a_vehicle(tmp_path: Path) -> None:
+    with SumoWorld(SCENARIO, tmp_path) as world:
+        world.show(TICK_S)
+        world.add("a", (50.0, 15.0, 0.0, 1.75, 0.0, 0.0))
+        world.step()
+        shown = traci.getConnection("laneweave-gui")
+        window = shown._process
+        assert isinstance(window, subprocess.Popen)
+        shown.vehicle.remove("a")
+        world.step()
+        assert window.wait(10.0) is not None
+        world.step()
+
+
+def test_another_run_of_the_process_has_a_window_too(tmp_path: Path) -> None:
+    for _ in range(2):
+        with SumoWorld(SCENARIO, tmp_path) as world:
+            world.show(TICK_S)
+            world.step()
+            traci.getConnection("laneweave-gui")._process.kill()
+            for _ in range(2):
+                world.step()
+
+
 def test_without_sumo_gui_a_line_says_what_to_install(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

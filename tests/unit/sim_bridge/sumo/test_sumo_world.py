@@ -123,6 +123,18 @@ def test_sumo_reports_a_collision_and_leaves_the_vehicles_where_they_are(world: 
         assert_exact(world, states)
 
 
+@pytest.mark.parametrize(("length_m", "gap_m", "overlaps"), [(1.8, 2.0, False), (16.0, -5.0, True)])
+def test_sumo_knows_the_sizes_of_vehicles_without_a_type(
+    world: SumoWorld, length_m: float, gap_m: float, overlaps: bool
+) -> None:
+    for s_m, name in ((100.0, "other"), (100.0 - length_m - gap_m, "v1")):
+        world.add(name, (s_m, 0.0, 0.0, 1.75, 0.0, 0.0))
+    world.resize("other", (length_m, 1.8))
+    for _ in range(2):
+        world.step()
+    assert (world.collisions() == [("other", "v1")]) is overlaps
+
+
 def test_misuse_is_refused(world: SumoWorld, tmp_path: Path) -> None:
     world.add("v1", cruising(0.0, 1.75))
     with pytest.raises(ValueError, match="already on the road"):
