@@ -9,7 +9,6 @@ with its acceleration lane, and a lane whose links lead out of it an exit.
 from __future__ import annotations
 
 import math
-from collections import Counter, deque
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from functools import cached_property
 from itertools import pairwise
@@ -22,6 +21,13 @@ from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.road_layout import END_OF_ROAD
 from laneweave.protocol.scenario.road_tables import MAIN_ENTRANCE, Closure
 from laneweave.protocol.vehicle.lane_ends import HANDOVER_M
+from laneweave.sim_bridge.corridors.corridor_way import (
+    OPTION,
+    check_right_of_way,
+    lane_shift,
+    shortest_way,
+    through_links,
+)
 from laneweave.sim_bridge.corridors.sumo_network import Edge, Lane, Link, Network, unique_name
 
 MAX_LANES = 8
@@ -44,7 +50,6 @@ MAX_SPEED_MPS = 60.0
 REACTION_S, DECEL_MPS2 = 1.0, 4.0
 """Reaction time of SUMO's default drivers, and deceleration of its default trucks, with which
 vehicles that are given back stop before crossings and traffic lights."""
-OPTION = "--corridor"
 NO_LANES: Mapping[str, tuple[int, ...]] = MappingProxyType({})
 
 
@@ -225,62 +230,13 @@ def corridor_of(
     for name in (first, last):
         if name not in network.edges:
             raise BadInputError(OPTION, name, "FIRST_EDGE:LAST_EDGE, two edges of the network")
-    way = _way(network, first, last)
+    way = shortest_way(network, first, last)
     for edge in way:
         if not edge.car_lanes:
             raise BadInputError(OPTION, edge.name, "edges with a lane for cars")
     for before, after in pairwise(way):
-        _check_right_of_way(network, before, after)
+        check_right_of_way(network, before, after)
     return _Derivation(network, way, departing, continuing).corridor()
-
-
-def _way(network: Network, first: str, last: str) -> tuple[Edge, ...]:
-    """Return the way with the fewest edges."""
-    before: dict[str, str] = {first: ""}
-    waiting = deque([first])
-    while waiting and last not in before:
-        name = waiting.popleft()
-        for edge in network.following(network.edges[name]):
-            if edge.name not in before:
-                before[edge.name] = name
-                waiting.append(edge.name)
-    if last not in before:
-        allowed = "FIRST_EDGE:LAST_EDGE with a way for cars from the first to the last; "
-        reached = f"{len(before) - 1} edges can be reached from {first}"
-        raise BadInputError(OPTION, f"{first}:{last}", allowed + reached)
-    names = [last]
-    while before[names[-1]]:
-        names.append(before[names[-1]])
-    return tuple(network.edges[name] for name in reversed(names))
-
-
-def through_links(network: Network, before: Edge, after: Edge) -> tuple[Link, ...]:
-    """Return the links by which lanes of an edge continue in the next one.
-
-    Their lanes are all shifted by the same number, the most frequent one; of several such numbers,
-    the one nearest to 0.
-    """
-    links = network.between(before, after)
-    counts = Counter(_shift(link) for link in links)
-    shift = min(counts, key=lambda one: (-counts[one], abs(one), one))
-    return tuple(link for link in links if _shift(link) == shift)
-
-
-def _shift(link: Link) -> int:
-    return link.target.index - link.origin.index
-
-
-def _check_right_of_way(network: Network, before: Edge, after: Edge) -> None:
-    """Check that vehicles need not give way between two edges."""
-    for link in through_links(network, before, after):
-        reason = f"its state is {link.state!r}"
-        if link.traffic_light:
-            reason = f"traffic light {link.traffic_light} controls it"
-        elif joins := network.joins(link):
-            reason = f"{joins} merges like a zipper, and would need an acceleration lane of its own"
-        if network.gives_way_at(link):
-            allowed = f"a corridor without crossings: the way to {after.name} has to have priority"
-            raise BadInputError(OPTION, before.name, f"{allowed}, but {reason}")
 
 
 @frozen
@@ -327,7 +283,7 @@ class _Derivation:
         edges = [CorridorEdge(way[0], 0.0, 0)]
         for edge, links in zip(way[1:], self._links, strict=True):
             at_m = edges[-1].to_m + median(link.length_m for link in links)
-            edges.append(CorridorEdge(edge, at_m, edges[-1].first_lane - _shift(links[0])))
+            edges.append(CorridorEdge(edge, at_m, edges[-1].first_lane - lane_shift(links[0])))
         lowest = min(one.first_lane + lane.index for one in edges for lane in one.edge.car_lanes)
         self._edges = tuple(evolve(one, first_lane=one.first_lane - lowest) for one in edges)
         self._unused: list[str] = []

@@ -12,7 +12,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from attrs import frozen
 
 from laneweave.protocol.errors import BadInputError
-from laneweave.sim_bridge.corridors.corridor import lanes_by_edge, through_links
+from laneweave.sim_bridge.corridors.corridor import lanes_by_edge
+from laneweave.sim_bridge.corridors.corridor_way import through_links
 from laneweave.sim_bridge.corridors.sumo_corridor import SumoCorridor, corridor_in
 from laneweave.sim_bridge.corridors.sumo_network import Edge, Link, Network
 from laneweave.sim_bridge.corridors.sumo_simulation import SumoSimulation

@@ -16,7 +16,8 @@ from itertools import accumulate, pairwise
 
 from attrs import evolve, frozen
 
-from laneweave.sim_bridge.corridors.corridor import Corridor, through_links
+from laneweave.sim_bridge.corridors.corridor import Corridor
+from laneweave.sim_bridge.corridors.corridor_way import through_links
 from laneweave.sim_bridge.corridors.sumo_network import Lane, Link, Point
 
 WorldPose = tuple[float, float, float]

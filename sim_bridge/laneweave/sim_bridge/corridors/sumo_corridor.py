@@ -13,7 +13,8 @@ from attrs import frozen
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.road_layout import ANY_LANE, END_OF_ROAD
 from laneweave.protocol.scenario.road_tables import MAIN_ENTRANCE
-from laneweave.sim_bridge.corridors.corridor import OPTION, Corridor, corridor_of
+from laneweave.sim_bridge.corridors.corridor import Corridor, corridor_of
+from laneweave.sim_bridge.corridors.corridor_way import OPTION
 from laneweave.sim_bridge.corridors.sumo_network import Link, Network, unique_name
 from laneweave.sim_bridge.corridors.sumo_simulation import (
     WHOLE,
