@@ -9,7 +9,7 @@ with its acceleration lane, and a lane whose links lead out of it an exit.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from functools import cached_property
 from itertools import pairwise
 from statistics import median
@@ -21,14 +21,16 @@ from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.road_layout import END_OF_ROAD
 from laneweave.protocol.scenario.road_tables import MAIN_ENTRANCE, Closure
 from laneweave.protocol.vehicle.lane_ends import HANDOVER_M
-from laneweave.sim_bridge.corridors.corridor_way import (
-    OPTION,
-    check_right_of_way,
+from laneweave.sim_bridge.corridors.sumo_network import (
+    Edge,
+    Lane,
+    Link,
+    Network,
+    grouped,
     lane_shift,
-    shortest_way,
     through_links,
+    unique_name,
 )
-from laneweave.sim_bridge.corridors.sumo_network import Edge, Lane, Link, Network, unique_name
 
 MAX_LANES = 8
 MAX_RAMP_M = 400.0
@@ -50,6 +52,7 @@ MAX_SPEED_MPS = 60.0
 REACTION_S, DECEL_MPS2 = 1.0, 4.0
 """Reaction time of SUMO's default drivers, and deceleration of its default trucks, with which
 vehicles that are given back stop before crossings and traffic lights."""
+OPTION = "--corridor"
 NO_LANES: Mapping[str, tuple[int, ...]] = MappingProxyType({})
 
 
@@ -202,15 +205,8 @@ def lanes_by_edge(network: Network, last: CorridorEdge) -> dict[str, list[int]]:
     return found
 
 
-_NO_ROUTES: Mapping[str, Collection[str]] = MappingProxyType({})
-
-
 def corridor_of(
-    network: Network,
-    first: str,
-    last: str,
-    departing: Collection[str] = (),
-    continuing: Mapping[str, Collection[str]] = _NO_ROUTES,
+    network: Network, first: str, last: str, routes: Iterable[Sequence[str]] = ()
 ) -> Corridor:
     """Return the corridor from one edge to another.
 
@@ -218,10 +214,9 @@ def corridor_of(
         network: the network.
         first: name of its first edge.
         last: name of its last edge.
-        departing: edges on which vehicles depart. A ramp begins with the last one of them, since
-            vehicles must not depart between vehicles that have been taken over.
-        continuing: edges to which vehicles drive from each edge; empty where their routes end.
-            A ramp begins behind edges from which some do not come to the corridor.
+        routes: edges of the routes of vehicles. A ramp begins with the last edge on which vehicles
+            depart, since none may depart between vehicles that have been taken over, and behind
+            edges from which some do not come to the corridor.
 
     Raises:
         BadInputError: an edge does not exist, no way leads from the first to the last, or vehicles
@@ -230,13 +225,39 @@ def corridor_of(
     for name in (first, last):
         if name not in network.edges:
             raise BadInputError(OPTION, name, "FIRST_EDGE:LAST_EDGE, two edges of the network")
-    way = shortest_way(network, first, last)
+    way = _way(network, first, last)
     for edge in way:
         if not edge.car_lanes:
             raise BadInputError(OPTION, edge.name, "edges with a lane for cars")
     for before, after in pairwise(way):
-        check_right_of_way(network, before, after)
-    return _Derivation(network, way, departing, continuing).corridor()
+        _check_right_of_way(network, before, after)
+    return _Derivation(network, way, routes).corridor()
+
+
+def _way(network: Network, first: str, last: str) -> tuple[Edge, ...]:
+    """Return the way with the fewest edges."""
+    before = network.reached_from(first)
+    if last not in before:
+        allowed = "FIRST_EDGE:LAST_EDGE with a way for cars from the first to the last; "
+        reached = f"{len(before) - 1} edges can be reached from {first}"
+        raise BadInputError(OPTION, f"{first}:{last}", allowed + reached)
+    names = [last]
+    while before[names[-1]]:
+        names.append(before[names[-1]])
+    return tuple(network.edges[name] for name in reversed(names))
+
+
+def _check_right_of_way(network: Network, before: Edge, after: Edge) -> None:
+    """Check that vehicles need not give way between two edges."""
+    for link in through_links(network, before, after):
+        reason = f"its state is {link.state!r}"
+        if link.traffic_light:
+            reason = f"traffic light {link.traffic_light} controls it"
+        elif joins := network.joins(link):
+            reason = f"{joins} merges like a zipper, and would need an acceleration lane of its own"
+        if network.gives_way_at(link):
+            allowed = f"a corridor without crossings: the way to {after.name} has to have priority"
+            raise BadInputError(OPTION, before.name, f"{allowed}, but {reason}")
 
 
 @frozen
@@ -268,15 +289,12 @@ class _Derivation:
     """The derivation of one corridor."""
 
     def __init__(
-        self,
-        network: Network,
-        way: tuple[Edge, ...],
-        departing: Collection[str],
-        continuing: Mapping[str, Collection[str]],
+        self, network: Network, way: tuple[Edge, ...], routes: Iterable[Sequence[str]]
     ) -> None:
         self._network = network
-        self._departing = departing
-        self._continuing = continuing
+        pairs = {pair for one in routes for pair in pairwise(("", *one, ""))}
+        self._continuing = grouped((before, after) for before, after in pairs)
+        """Edges to which vehicles drive from each edge; "" before and after their routes."""
         self._names = {edge.name for edge in way}
         self._limit_mps = min(lane.speed_mps for edge in way for lane in edge.car_lanes)
         self._links = [through_links(network, *pair) for pair in pairwise(way)]
@@ -417,19 +435,17 @@ class _Derivation:
         seen = set[str]()
         while link.has_priority and link.origin.name not in seen and length_m < MAX_RAMP_M:
             lane = link.origin
-            lanes = self._network.edges[lane.edge].car_lanes
-            ways = [{on.target.edge for on in self._network.links_from(one)} for one in lanes]
-            onwards = {link.target.edge}
-            if not onwards.issuperset(self._continuing.get(lane.edge, ())) or not all(
-                onwards <= edges for edges in ways
-            ):
+            edge, onwards = self._network.edges[lane.edge], link.target.edge
+            elsewhere = {*self._continuing.get(edge.name, ())} - {onwards}
+            if elsewhere or not self._network.leads_to(edge, onwards):
                 break
             seen.add(lane.name)
             path.append(link)
             length_m += lane.length_m + link.length_m
             speed_mps = min(speed_mps, lane.speed_mps)
             before = self._network.links_to(lane)
-            if len(before) != 1 or len(lanes) > 1 or lane.edge in self._departing:
+            departing = edge.name in self._continuing.get("", ())
+            if len(before) != 1 or len(edge.car_lanes) > 1 or departing:
                 break
             link = before[0]
         return length_m, speed_mps, tuple(path)

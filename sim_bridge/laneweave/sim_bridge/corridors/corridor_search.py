@@ -13,9 +13,8 @@ from attrs import frozen
 
 from laneweave.protocol.errors import BadInputError
 from laneweave.sim_bridge.corridors.corridor import lanes_by_edge
-from laneweave.sim_bridge.corridors.corridor_way import through_links
 from laneweave.sim_bridge.corridors.sumo_corridor import SumoCorridor, corridor_in
-from laneweave.sim_bridge.corridors.sumo_network import Edge, Link, Network
+from laneweave.sim_bridge.corridors.sumo_network import Edge, Link, Network, through_links
 from laneweave.sim_bridge.corridors.sumo_simulation import SumoSimulation
 
 MIN_LANES = 2

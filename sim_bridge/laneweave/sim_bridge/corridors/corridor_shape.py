@@ -17,8 +17,7 @@ from itertools import accumulate, pairwise
 from attrs import evolve, frozen
 
 from laneweave.sim_bridge.corridors.corridor import Corridor
-from laneweave.sim_bridge.corridors.corridor_way import through_links
-from laneweave.sim_bridge.corridors.sumo_network import Lane, Link, Point
+from laneweave.sim_bridge.corridors.sumo_network import Lane, Link, Point, through_links
 
 WorldPose = tuple[float, float, float]
 """(x, y [m], direction [rad], anticlockwise from east)."""

@@ -21,6 +21,7 @@ from laneweave.protocol.vehicle.re_entry import own_re_entry, re_entry
 from laneweave.protocol.wire.messages import CAR
 from laneweave.sim_bridge.corridors.corridor import (
     MAX_SPEED_MPS,
+    OPTION,
     POCKET_M,
     POCKET_S,
     RESERVE_SHARE,
@@ -28,7 +29,6 @@ from laneweave.sim_bridge.corridors.corridor import (
     Ramp,
     lattice_speed_mps,
 )
-from laneweave.sim_bridge.corridors.corridor_way import OPTION
 from laneweave.sim_bridge.corridors.settling import SLOW_ENTRY_S
 from laneweave.sim_bridge.corridors.sumo_corridor import Pass, SumoCorridor
 from laneweave.sim_bridge.corridors.sumo_simulation import SumoType

@@ -13,8 +13,7 @@ from attrs import frozen
 from laneweave.protocol.errors import BadInputError
 from laneweave.protocol.road_layout import ANY_LANE, END_OF_ROAD
 from laneweave.protocol.scenario.road_tables import MAIN_ENTRANCE
-from laneweave.sim_bridge.corridors.corridor import Corridor, corridor_of
-from laneweave.sim_bridge.corridors.corridor_way import OPTION
+from laneweave.sim_bridge.corridors.corridor import OPTION, Corridor, corridor_of
 from laneweave.sim_bridge.corridors.sumo_network import Link, Network, unique_name
 from laneweave.sim_bridge.corridors.sumo_simulation import (
     WHOLE,
@@ -134,8 +133,7 @@ def read_corridor(file: Path, name: str, window: TimeWindow = WHOLE, seed: int =
 
 def corridor_in(simulation: SumoSimulation, first: str, last: str) -> SumoCorridor:
     """Return the corridor from one edge to another, with its vehicles; see `corridor_of`."""
-    departing, continuing = simulation.departing, simulation.continuing
-    corridor = corridor_of(simulation.network, first, last, departing, continuing)
+    corridor = corridor_of(simulation.network, first, last, simulation.routes)
     passes, left_out = list[Pass](), dict[str, str]()
     for vehicle in simulation.vehicles:
         found = _pass_of(vehicle, corridor)

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 import re
+from collections import Counter, deque
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
+from typing import TypeVar
 
 from attrs import define, field, frozen
 
@@ -26,6 +28,9 @@ _MOST_ACROSS = 8
 _SIDES = {"left": 1, "right": -1}
 """SUMO's numbers for the sides to which vehicles change lanes."""
 Point = tuple[float, float]
+
+
+_T = TypeVar("_T")
 
 
 @frozen
@@ -117,11 +122,11 @@ class Network:
 
     @cached_property
     def _from(self) -> Mapping[str, list[Link]]:
-        return _grouped((link.origin.name, link) for link in self.links)
+        return grouped((link.origin.name, link) for link in self.links)
 
     @cached_property
     def _to(self) -> Mapping[str, list[Link]]:
-        return _grouped((link.target.name, link) for link in self.links)
+        return grouped((link.target.name, link) for link in self.links)
 
     def links_from(self, lane: Lane) -> Sequence[Link]:
         """Return the links that begin at the end of a lane."""
@@ -144,10 +149,29 @@ class Network:
         others = {each.origin.edge for each in self.links_to(link.target)} - {link.origin.edge}
         return min(others, default="") if link.state == ZIPPER else ""
 
+    def leads_to(self, edge: Edge, after: str) -> bool:
+        """Return whether each lane of an edge leads to another edge."""
+        ways = [{link.target.edge for link in self.links_from(one)} for one in edge.car_lanes]
+        return all(after in names for names in ways)
+
     def gives_way_at(self, link: Link) -> bool:
         """Return whether vehicles on a corridor have to give way at a link of it."""
         is_drop = link.state == ZIPPER and not link.traffic_light and not self.joins(link)
         return not (is_drop or link.has_priority)
+
+    def reached_from(self, first: str) -> Mapping[str, str]:
+        """Return the edges that can be reached from an edge, each with the one before it.
+
+        The edge before the first one is empty; ways have as few edges as possible.
+        """
+        before, waiting = {first: ""}, deque([first])
+        while waiting:
+            name = waiting.popleft()
+            for edge in self.following(self.edges[name]):
+                if edge.name not in before:
+                    before[edge.name] = name
+                    waiting.append(edge.name)
+        return before
 
     def following(self, edge: Edge) -> tuple[Edge, ...]:
         """Return the edges to which an edge has links."""
@@ -155,10 +179,28 @@ class Network:
         return tuple(self.edges[name] for name in names)
 
 
-def _grouped(pairs: Iterable[tuple[str, Link]]) -> Mapping[str, list[Link]]:
-    groups: dict[str, list[Link]] = {}
-    for name, link in pairs:
-        groups.setdefault(name, []).append(link)
+def through_links(network: Network, before: Edge, after: Edge) -> tuple[Link, ...]:
+    """Return the links by which lanes of an edge continue in the next one.
+
+    Their lanes are all shifted by the same number, the most frequent one; of several such numbers,
+    the one nearest to 0.
+    """
+    links = network.between(before, after)
+    counts = Counter(lane_shift(link) for link in links)
+    shift = min(counts, key=lambda one: (-counts[one], abs(one), one))
+    return tuple(link for link in links if lane_shift(link) == shift)
+
+
+def lane_shift(link: Link) -> int:
+    """Return by how many lanes the number of the next lane is higher."""
+    return link.target.index - link.origin.index
+
+
+def grouped(pairs: Iterable[tuple[str, _T]]) -> Mapping[str, list[_T]]:
+    """Return the second values of pairs by the first ones."""
+    groups: dict[str, list[_T]] = {}
+    for name, item in pairs:
+        groups.setdefault(name, []).append(item)
     return groups
 
 

@@ -9,8 +9,8 @@ laneweave and SUMO alone drive afterwards.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator, Mapping
-from itertools import pairwise, zip_longest
+from collections.abc import Iterator, Mapping
+from itertools import pairwise
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
@@ -131,18 +131,9 @@ class SumoSimulation:
         return max(self.end_s - self.begin_s, 1.0)
 
     @property
-    def departing(self) -> frozenset[str]:
-        """The edges on which vehicles depart."""
-        return frozenset(vehicle.route[0] for vehicle in self.vehicles if vehicle.route)
-
-    @property
-    def continuing(self) -> Mapping[str, Collection[str]]:
-        """The edges to which vehicles drive from each edge; empty where their routes end."""
-        found: dict[str, set[str]] = {}
-        for route in {vehicle.route for vehicle in self.vehicles}:
-            for edge, after in zip_longest(route, route[1:], fillvalue=""):
-                found.setdefault(edge, set()).add(after)
-        return found
+    def routes(self) -> frozenset[tuple[str, ...]]:
+        """The routes of all vehicles: edges, in order."""
+        return frozenset(vehicle.route for vehicle in self.vehicles if vehicle.route)
 
     def write(self, file: Path, departures: Mapping[str, Attributes | None]) -> Mapping[str, str]:
         """Write a file of routes, and return the option that names it.

@@ -202,16 +202,16 @@ def test_a_ramp_begins_behind_edges_that_lead_elsewhere_too(
     """SUMO drives other vehicles there."""
     (whole,) = corridor_of(network, "main1", "main5").ramps
     assert [link.origin.edge for link in whole.path] == ["on", "before"]
-    forked, after = with_way_out(network, edge, index), {"before": "on", "on": "main4"}[edge]
-    (ramp,) = corridor_of(forked, "main1", "main5", (), {edge: {after, "away"}}).ramps
+    routes = [("first", "before", "on", "main4"), ("first", edge, "away")]
+    (ramp,) = corridor_of(with_way_out(network, edge, index), "main1", "main5", routes).ramps
     assert [link.origin.edge for link in ramp.path] == path
 
 
 @pytest.mark.parametrize("ends", [False, True])
 def test_a_ramp_begins_behind_an_edge_on_which_a_route_ends(network: Network, ends: bool) -> None:
     """Not behind one from which a way leads back that nobody takes, as netconvert adds them."""
-    routes = {"before": {"on", ""} if ends else {"on"}}
-    (ramp,) = corridor_of(with_way_out(network, "before", 0), "main1", "main5", (), routes).ramps
+    routes = [("first", "before", "on", "main4"), *([("first", "before")] if ends else [])]
+    (ramp,) = corridor_of(with_way_out(network, "before", 0), "main1", "main5", routes).ramps
     assert [link.origin.edge for link in ramp.path] == (["on"] if ends else ["on", "before"])
 
 
@@ -226,7 +226,7 @@ def test_a_ramp_begins_behind_edges_with_lanes_that_end(network: Network) -> Non
 
 def test_a_ramp_whose_last_edge_leads_elsewhere_too_is_refused(interchange: SumoCorridor) -> None:
     network = with_way_out(interchange.simulation.network, "on", 0)
-    corridor = corridor_of(network, "main1", "main5", (), {"on": {"main4", "away"}})
+    corridor = corridor_of(network, "main1", "main5", [("before", "on", "away")])
     with pytest.raises(BadInputError, match="only to the corridor"):
         checked(interchange, ramps=corridor.ramps)
 
