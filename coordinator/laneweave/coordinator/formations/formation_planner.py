@@ -125,6 +125,8 @@ class FormationPlanner:
         """Waiting requests, oldest first: ballot and computation of each formation."""
         self._under_way: tuple[int, int, Ballot] | None = None
         """Id, formation and ballot of the current computation."""
+        self._formed: dict[int, tuple[object, bool]] = {}
+        """Last answer of `has_formed` for each formation, and for what."""
         self.pace = RoadPace()
         """Pace of the road, for deadlines."""
         self.leading_since_s: float | None = None
@@ -139,6 +141,7 @@ class FormationPlanner:
     def forget(self) -> None:
         """Discard all waiting requests; the coordinator has begun or stopped leading."""
         self._waiting.clear()
+        self._formed.clear()
         self.leading_since_s = None
 
     def _deadline_s(self, start_s: float, t_s: float) -> float:
@@ -193,7 +196,14 @@ class FormationPlanner:
 
     def has_formed(self, formation: Formation, states: Mapping[Name, VehicleState]) -> bool:
         """Return whether a formation has the structure of its stage, if there is one."""
-        return has_formed(self._task(formation, states))
+        if formation.stage.structure is None:
+            return True
+        # Leaders ask with every state, and hold cells rarely change.
+        members = tuple((states[one].hold_cell, states[one].attended) for one in formation.roster)
+        asked, number = (formation, members), formation.numbers[0]
+        if self._formed.get(number, (None, True))[0] != asked:
+            self._formed[number] = asked, has_formed(self._task(formation, states))
+        return self._formed[number][1]
 
     def _task(self, formation: Formation, states: Mapping[Name, VehicleState]) -> SortingTask:
         """Return the task of a formation from its members' states, without a deadline."""

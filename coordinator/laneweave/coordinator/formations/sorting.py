@@ -38,7 +38,8 @@ from laneweave.protocol.wire.messages import Name
 from laneweave.protocol.wire.reasons import BLOCKED, CLOSED_LANE, NO_AGENT, NO_ROOM, TOO_LATE
 
 MAX_PLACEMENTS = 6
-"""Maximum number of placements of the parallel structure, if plans have too many steps."""
+"""Maximum number of placements of the parallel structure that are tried until a plan has few enough
+steps."""
 MAX_SHORTER_PLANS = 4
 """Maximum number of further requests if the cheapest plan into lanes has too many steps. The first
 one limits the plan to the steps that fit, each later one permits one step more."""
@@ -180,6 +181,8 @@ class Sorting:
 
 def plan_requests(task: SortingTask, exempt: Name | None = None) -> Iterator[PlanRequest]:
     """Yield plan requests: the first one, and those to try if its plan has too many steps.
+
+    Further placements of the parallel structure are also for the case that it has no plan.
 
     Args:
         task: a task with at least one vehicle that can move.

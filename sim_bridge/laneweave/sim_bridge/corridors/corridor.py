@@ -214,9 +214,9 @@ def corridor_of(
         network: the network.
         first: name of its first edge.
         last: name of its last edge.
-        routes: edges of the routes of vehicles. A ramp begins with the last edge on which vehicles
-            depart, since none may depart between vehicles that have been taken over, and behind
-            edges from which some do not come to the corridor.
+        routes: routes of all vehicles: edges, in order. A ramp begins with the last edge on which
+            vehicles depart, since none may depart between vehicles that have been taken over, and
+            behind edges from which some vehicles drive elsewhere or end their routes.
 
     Raises:
         BadInputError: an edge does not exist, no way leads from the first to the last, or vehicles

@@ -88,6 +88,7 @@ class CorridorWorld(SumoProcess, BodiesWorld):
         Raises:
             SumoUnavailableError: libsumo cannot be loaded.
             SumoFailedError: SUMO rejects a file.
+            BadInputError: a lane to which vehicles come from upstream is closed at the start.
         """
         scenario, found, corridor = setup.scenario, setup.found, setup.found.corridor
         entrances = {one.name for one in scenario.entrance}
@@ -96,6 +97,7 @@ class CorridorWorld(SumoProcess, BodiesWorld):
         ways = [one for one in found.ways_in if one.entrance in entrances]
         self.start_lanes = tuple(one.lane for one in ways if one.entrance == MAIN_ENTRANCE)
         """Lanes to whose beginning vehicles come from upstream."""
+        # Before SUMO starts, so that none is left open.
         if closed := {*self.start_lanes} - {*scenario.road.first_lanes}:
             allowed = "lanes that are open at the start, to which vehicles come from upstream"
             raise BadInputError("road.closures", f"lane {min(closed)}", allowed)

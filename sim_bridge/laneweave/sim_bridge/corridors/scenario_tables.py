@@ -361,7 +361,7 @@ def _motion(tables: Tables, corridor: Corridor, speed_mps: float) -> dict[str, A
         if not ramp.path:
             allowed = (
                 "on-ramps whose vehicles have priority where their acceleration lanes begin, and "
-                "on whose edges vehicles drive only to the corridor"
+                "from whose last edges all lanes and all vehicles lead to the corridor"
             )
             raise BadInputError(f"{OPTION} {corridor.name}, on-ramp", ramp.edge, allowed)
         raise BadInputError(

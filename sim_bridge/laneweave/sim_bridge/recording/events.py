@@ -37,7 +37,8 @@ def line_of(t_s: float, kind: str, data: Mapping[str, object]) -> bytes:
 def _supported(value: object) -> object:
     """Return a value with text for keys and numbers that JSON does not support."""
     if isinstance(value, Mapping):
-        return {str(key): _supported(item) for key, item in value.items()}
+        keys = (key if isinstance(key, str | int | None) else str(key) for key in value)
+        return dict(zip(keys, map(_supported, value.values()), strict=True))
     if isinstance(value, list | tuple):
         return [_supported(item) for item in value]
     return str(value) if isinstance(value, float) and not math.isfinite(value) else value

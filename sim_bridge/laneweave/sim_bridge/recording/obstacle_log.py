@@ -53,7 +53,7 @@ class ObstacleLog:
             number = self._ahead(lane, s_m)
             has_broken_down = any(vehicle == own for _, _, own, _ in self._active)
             if number is not None and not has_broken_down:
-                # A vehicle that drives back into a cell may stop once more before it has one.
+                # It may stop again before it has a cell: both waits count, the vehicle only once.
                 self._end_wait(vehicle, t_s)
                 self._waits[vehicle] = number, t_s
                 if (vehicle, number) not in self._stopped:

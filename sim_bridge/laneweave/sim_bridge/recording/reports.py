@@ -16,8 +16,8 @@ from laneweave.protocol.wire.process_messages import Report
 from laneweave.sim_bridge.recording.statistics import finite
 
 MAX_SENDERS = 256
-"""Number of agents, and of processes, whose newest reports are stored. An older report is final: by
-then, the vehicle of the agent has left the road. Those of others are stored until the end."""
+"""Maximum number of agents whose newest reports are stored, and of their processes. An older report
+is final: by then, the vehicle of the agent has left the road. Others report until the end."""
 MAX_SOLVE_MS = 1000.0
 """Longer solves count as this long."""
 _BINS_PER_MS = 1000
@@ -79,8 +79,10 @@ class ReportTotals:
     """Sums over all other senders and processes."""
     _processes: dict[Name, Counter[str]] = field(factory=dict)
     """Counters of the processes of these senders."""
-    _others: set[Name] = field(factory=set)
-    """Processes that are no agents."""
+    _kept_senders: set[tuple[Name, Name]] = field(factory=set)
+    """Senders that are no agents, whose reports are never final."""
+    _kept_processes: set[Name] = field(factory=set)
+    """Their processes."""
     _solve_times: SolveTimes = field(factory=SolveTimes)
     """Durations in reports that are final."""
 
@@ -92,12 +94,13 @@ class ReportTotals:
         counters = Counter({name: getattr(report, name) for name in _OF_PROCESS})
         self._processes[report.process] = counters | self._processes.pop(report.process, counters)
         if report.role != _AGENT:
-            self._others.add(report.process)
-        agents = (one for one in self._newest if one[0] == _AGENT)
-        if len(self._newest) > MAX_SENDERS and (oldest := next(agents, None)):
+            self._kept_senders.add(sender)
+            self._kept_processes.add(report.process)
+        if len(self._newest) - len(self._kept_senders) > MAX_SENDERS:
+            oldest = next(one for one in self._newest if one not in self._kept_senders)
             self._finish(self._newest.pop(oldest))
-        processes = (one for one in self._processes if one not in self._others)
-        if len(self._processes) > MAX_SENDERS and (first := next(processes, None)):
+        if len(self._processes) - len(self._kept_processes) > MAX_SENDERS:
+            first = next(one for one in self._processes if one not in self._kept_processes)
             self._final += self._processes.pop(first)
 
     def total(self, counter: str) -> int:

@@ -58,7 +58,10 @@ class SumoWorld(SumoSession, BodiesWorld):
         self._move(vehicle, state)
 
     def resize(self, vehicle: str, size: Size) -> None:
-        """Set length and width [m] of a vehicle; its heading must stay 0."""
+        """Set length and width [m] of a vehicle.
+
+        Its heading must stay 0: rotated bodies are shown with the lengths of their types.
+        """
         self.vehicle.setLength(vehicle, size[0])
         self.vehicle.setWidth(vehicle, size[1])
 

@@ -14,6 +14,7 @@ from laneweave.coordinator.formations.roster import Numbers
 from laneweave.coordinator.formations.sorting import (
     Sorting,
     SortingTask,
+    has_formed,
     plan_requests,
     sort_lanes,
 )
@@ -236,6 +237,22 @@ def test_a_structure_that_cannot_be_reached_is_planned_once() -> None:
     lane_2 = DrivingStructure(from_m=200.0, structure="parallel", lanes=(2,))
     sorting = sort_lanes(evolve(order, structure=lane_2), NODES, count, time.monotonic)
     assert (sorting.solved, len(asked)) == (False, 1)
+
+
+def test_whether_a_structure_is_formed() -> None:
+    order = task({A: (-1, 0), B: (-1, 1), C: (-2, 0)}, {})
+    assert has_formed(order)  # no structure
+    right, left = (DrivingStructure(0.0, "parallel", lanes) for lanes in ((0, 1), (1, 2)))
+    assert has_formed(evolve(order, structure=right))
+    assert not has_formed(evolve(order, structure=left))
+    # A vehicle without agent is in the way, so that the others form a structure around it.
+    others = evolve(order, unattended={B}, structure=DrivingStructure(0.0, "parallel", (0,)))
+    assert has_formed(others)
+    assert not has_formed(evolve(others, structure=DrivingStructure(0.0, "parallel", (1,))))
+    # There are too few cells for the vehicles, so there is nothing to form.
+    crowd = {Name(f"v{n}"): (-(n % 4), n // 4) for n in range(6)}
+    narrow = DrivingStructure(0.0, "interlaced", (0, 1))
+    assert has_formed(evolve(task(crowd, {}), structure=narrow))
 
 
 @pytest.mark.slow

@@ -158,6 +158,8 @@ def test_structures_are_formed_wherever_their_front_is(
     assert is_formed(structure, range(3), Grid(8, 3), cells) is formed
 
 
+@pytest.mark.slow
+@examples(300)
 @given(crowds(), st.sampled_from(STRUCTURES))
 def test_targets_are_a_structure_with_the_shortest_total_distance(
     crowd: tuple[Grid, list[Cell], list[int | None]], structure: str

@@ -215,19 +215,22 @@ def test_a_ramp_begins_behind_an_edge_on_which_a_route_ends(network: Network, en
     assert [link.origin.edge for link in ramp.path] == (["on"] if ends else ["on", "before"])
 
 
-def test_a_ramp_begins_behind_edges_with_lanes_that_end(network: Network) -> None:
+@pytest.mark.parametrize(("edge", "path"), [("before", ["on"]), ("on", [])])
+def test_a_ramp_begins_behind_edges_with_lanes_that_end(
+    network: Network, edge: str, path: list[str]
+) -> None:
     """Vehicles in them would come to the ramp's lane after it has begun."""
-    before = network.edges["before"]
-    lanes = (*before.lanes, evolve(before.lanes[0], name="before_1", index=1))
-    edges = {**network.edges, "before": evolve(before, lanes=lanes)}
+    lanes = network.edges[edge].lanes
+    lanes = (*lanes, evolve(lanes[0], name=f"{edge}_1", index=1))
+    edges = {**network.edges, edge: evolve(network.edges[edge], lanes=lanes)}
     (ramp,) = corridor_of(Network(edges, network.links), "main1", "main5").ramps
-    assert [link.origin.edge for link in ramp.path] == ["on"]
+    assert [link.origin.edge for link in ramp.path] == path
 
 
 def test_a_ramp_whose_last_edge_leads_elsewhere_too_is_refused(interchange: SumoCorridor) -> None:
     network = with_way_out(interchange.simulation.network, "on", 0)
     corridor = corridor_of(network, "main1", "main5", [("before", "on", "away")])
-    with pytest.raises(BadInputError, match="only to the corridor"):
+    with pytest.raises(BadInputError, match="lead to the corridor"):
         checked(interchange, ramps=corridor.ramps)
 
 

@@ -43,6 +43,9 @@ def test_a_vehicle_that_stops_twice_before_it_has_a_cell_waits_all_the_time() ->
         log.on_lane_end(t_s, Name("v1"), 1, LEFT_LATTICE, 590.0)
     log.on_lane_end(100.0, Name("v1"), 1, ENTERED_LATTICE, 595.0)
     assert stops(log) == [(1, 40.0)]
+    log.on_lane_end(110.0, Name("v1"), 1, LEFT_LATTICE, 592.0)
+    log.on_lane_end(115.0, Name("v1"), 1, ENTERED_LATTICE, 595.0)
+    assert stops(log) == [(1, 45.0)]
 
 
 def test_a_part_may_be_closed_in_the_tick_in_which_another_one_is_opened() -> None:

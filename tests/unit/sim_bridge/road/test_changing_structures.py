@@ -23,7 +23,7 @@ from support.paper import EXACT
 pytestmark = pytest.mark.slow
 
 BEFORE_STAGE_S = 40.2
-"""Just before the last vehicle passes the beginning of the second structure."""
+"""Just before the second structure is planned, 5 s before the rear passes its beginning."""
 LOOK_S = 0.5
 """How long before a change the cells are looked at."""
 
@@ -93,6 +93,7 @@ def test_a_formation_takes_on_one_structure_after_the_other(
     plans = of_kind(events, "plan-made")
     assert [plan["vehicles"] for plan in plans] == [6, 6, 6]
     assert {plan["solver"] for plan in plans} == {"branching"}
+    assert [plan["name"] == plans[0]["name"] for plan in plans[1:]] == 2 * [not leader_hangs]
 
     interlaced = before(cells, plans[1])
     assert len({(column + lane) % 2 for column, lane in interlaced.values()}) == 1

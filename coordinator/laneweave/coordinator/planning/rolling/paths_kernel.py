@@ -21,7 +21,7 @@ MAX_EJECTED = 100
 """Maximum number of ejections in one ejection chain."""
 _IMPASSABLE = 5e3
 """Cost at which paths are rejected, and factor of forbidden conflicts. Conflict-free paths cost at
-most a quarter of this; a conflict with a `FIXED` vehicle costs at least half of this."""
+most a quarter of this."""
 UNREACHED = 1e9
 NO_PATH = 1e9
 """Cost of a vehicle without a path."""

@@ -97,7 +97,9 @@ def _path(road: StreamRoad, slot: int, cell: Cell, move: Cell) -> CellPath:
 
 
 def _refuse_conflicts(road: StreamRoad, moves: dict[Cell, Cell]) -> None:
-    """Replace as few moves by waiting as leave no move that conflicts with another vehicle.
+    """Replace conflicting moves by waiting.
+
+    No remaining move conflicts with another vehicle, and each replaced one would.
 
     Args:
         road: defines conflicts.
@@ -125,7 +127,7 @@ def _refuse_conflicts(road: StreamRoad, moves: dict[Cell, Cell]) -> None:
             if moves[cell] != WAIT and conflicts(cell, moves[cell]):
                 moves[cell] = WAIT
                 refused = True
-    # Some were refused because of others that were refused later.
+    # Grant again what was refused only because of moves that were refused later.
     for cell in reversed(from_rear):
         if wanted[cell] != moves[cell] and not conflicts(cell, wanted[cell]):
             moves[cell] = wanted[cell]
