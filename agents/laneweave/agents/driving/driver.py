@@ -21,7 +21,7 @@ from laneweave.agents.driving.stop_lines import StopLines
 from laneweave.agents.driving.surroundings import Surroundings
 from laneweave.agents.driving.tracker import Tracker
 from laneweave.agents.driving.tracking_problem import NO_GAPS
-from laneweave.protocol.lattice import Cell, PlannedMove, displacements
+from laneweave.protocol.lattice import Cell, PlannedMove
 from laneweave.protocol.scenario.fields import Scenario
 from laneweave.protocol.scenario.vehicle_tables import Vehicle
 from laneweave.protocol.vehicle.lane_ends import LaneEnds
@@ -120,7 +120,6 @@ class TrackingDriver:
         """Cell in which the newest motion began; the goal once that motion has ended."""
         self._goal: Cell = (0, 0)
         self._durations = scenario.timing.move_durations
-        self._displacements = displacements(scenario.formation.mode)
         self._ticks = 0
         """Duration of the newest move [ticks]."""
         self._lattice = scenario.lattice
@@ -141,7 +140,7 @@ class TrackingDriver:
         self._origin = self._goal = sense.hold_cell
         self._settling, motion = None, sense.motion
         (column, lane), (origin_column, origin_lane) = sense.hold_cell, motion.origin
-        is_move = (column - origin_column, lane - origin_lane) in self._displacements
+        is_move = max(abs(column - origin_column), abs(lane - origin_lane)) <= 1
         if motion.origin == sense.hold_cell and motion.end_tick > sense.tick + 3:
             commanded = self._commanded(sense)
             self._reference = self._settling = Reference.settling(

@@ -168,7 +168,7 @@ def test_a_motion_that_is_over_or_of_an_impossible_duration_is_taken_over_as_a_h
     assert drive.motion == CurrentMotion(MOVE[2])
 
 
-@pytest.mark.parametrize("origin", [(40, 1), (-2, 3)])
+@pytest.mark.parametrize("origin", [(40, 1), (-3, 2)])
 def test_a_motion_that_does_not_lead_to_a_neighbouring_cell_is_taken_over_as_a_hold(
     origin: Cell,
 ) -> None:
