@@ -126,7 +126,7 @@ class FormationPlanner:
         self._under_way: tuple[int, int, Ballot] | None = None
         """Id, formation and ballot of the current computation."""
         self._formed: dict[int, tuple[object, bool]] = {}
-        """Last answer of `has_formed` for each formation, and for what."""
+        """Input and result of the last call of `has_formed` for each formation."""
         self.pace = RoadPace()
         """Pace of the road, for deadlines."""
         self.leading_since_s: float | None = None
@@ -200,9 +200,9 @@ class FormationPlanner:
             return True
         # Leaders ask with every state, and hold cells rarely change.
         members = tuple((states[one].hold_cell, states[one].attended) for one in formation.roster)
-        asked, number = (formation, members), formation.numbers[0]
-        if self._formed.get(number, (None, True))[0] != asked:
-            self._formed[number] = asked, has_formed(self._task(formation, states))
+        given, number = (formation, members), formation.numbers[0]
+        if self._formed.get(number, (None, True))[0] != given:
+            self._formed[number] = given, has_formed(self._task(formation, states))
         return self._formed[number][1]
 
     def _task(self, formation: Formation, states: Mapping[Name, VehicleState]) -> SortingTask:

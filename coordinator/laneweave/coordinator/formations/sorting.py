@@ -182,7 +182,7 @@ class Sorting:
 def plan_requests(task: SortingTask, exempt: Name | None = None) -> Iterator[PlanRequest]:
     """Yield plan requests: the first one, and those to try if its plan has too many steps.
 
-    Further placements of the parallel structure are also for the case that it has no plan.
+    Further placements of the parallel structure are also tried if it has no plan.
 
     Args:
         task: a task with at least one vehicle that can move.

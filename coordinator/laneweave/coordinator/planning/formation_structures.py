@@ -83,12 +83,11 @@ def is_formed(structure: str, lanes: Sequence[int], grid: Grid, cells: Sequence[
         cells: current cells of the vehicles.
     """
     unnamed, occupied = [None] * len(cells), sorted(cells)
-    return any(
-        sorted(_fill(front, lanes_of, unnamed) or ()) == occupied
-        for columns in _variants(structure, lanes, grid)
-        for lanes_of in (_lanes_by_column(columns),)
-        for front in lanes_of
-    )
+    for columns in _variants(structure, lanes, grid):
+        lanes_of = _lanes_by_column(columns)
+        if any(sorted(_fill(front, lanes_of, unnamed) or ()) == occupied for front in lanes_of):
+            return True
+    return False
 
 
 def ranked_runs(

@@ -36,6 +36,11 @@ class Obstacle(Message, frozen=True):
     speed_mps: Real = 0.0
     """Speed of a vehicle that is passing."""
 
+    @property
+    def identity(self) -> tuple[int, float, Name | None, float]:
+        """What stays the same while the part becomes longer or shorter."""
+        return self.lane, self.from_m, self.vehicle, self.since_s
+
 
 class Cleared(Message, frozen=True):
     """Part of a lane that vehicles leave, and that none may enter; part of `Obstacles`."""

@@ -34,7 +34,7 @@ class BodiesWorld:
         self.states[vehicle] = state
 
     def resize(self, vehicle: str, size: Size) -> None:
-        """Do nothing: sizes do not matter here."""
+        """Do nothing: this world does not use sizes."""
 
     def place(self, vehicle: str, state: State) -> None:
         """Set the state of a vehicle at the end of the next step.

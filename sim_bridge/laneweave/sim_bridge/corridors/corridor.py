@@ -294,7 +294,7 @@ class _Derivation:
         self._network = network
         pairs = {pair for one in routes for pair in pairwise(("", *one, ""))}
         self._continuing = grouped((before, after) for before, after in pairs)
-        """Edges to which vehicles drive from each edge; "" before and after their routes."""
+        """Next edges of the vehicles on each edge; "" is before and after their routes."""
         self._names = {edge.name for edge in way}
         self._limit_mps = min(lane.speed_mps for edge in way for lane in edge.car_lanes)
         self._links = [through_links(network, *pair) for pair in pairwise(way)]

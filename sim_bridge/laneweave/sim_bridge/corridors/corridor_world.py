@@ -97,7 +97,7 @@ class CorridorWorld(SumoProcess, BodiesWorld):
         ways = [one for one in found.ways_in if one.entrance in entrances]
         self.start_lanes = tuple(one.lane for one in ways if one.entrance == MAIN_ENTRANCE)
         """Lanes to whose beginning vehicles come from upstream."""
-        # Before SUMO starts, so that none is left open.
+        # Checked before SUMO starts, so that no SUMO is left open.
         if closed := {*self.start_lanes} - {*scenario.road.first_lanes}:
             allowed = "lanes that are open at the start, to which vehicles come from upstream"
             raise BadInputError("road.closures", f"lane {min(closed)}", allowed)

@@ -35,7 +35,7 @@ def line_of(t_s: float, kind: str, data: Mapping[str, object]) -> bytes:
 
 
 def _supported(value: object) -> object:
-    """Return a value with text for keys and numbers that JSON does not support."""
+    """Return a copy of a value in which keys and numbers that JSON does not support are text."""
     if isinstance(value, Mapping):
         keys = (key if isinstance(key, str | int | None) else str(key) for key in value)
         return dict(zip(keys, map(_supported, value.values()), strict=True))

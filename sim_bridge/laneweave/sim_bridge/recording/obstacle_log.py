@@ -18,7 +18,7 @@ class ObstacleLog:
 
     _figures: list[ObstacleFigures] = field(factory=list)
     _active: dict[tuple[int, float, Name | None, float], int] = field(factory=dict)
-    """Index in `_figures` of each part that is closed now, by lane, beginning, vehicle and time."""
+    """Index in `_figures` of each part that is closed now, by its identity."""
     _waits: dict[Name, tuple[int, float]] = field(factory=dict)
     """Index of the part at which each vehicle waits, and road time since which it does."""
     _stopped: set[tuple[Name, int]] = field(factory=set)
@@ -26,7 +26,7 @@ class ObstacleLog:
 
     def on_obstacle(self, t_s: float, kind: str, obstacle: Obstacle) -> None:
         """Note that a part is closed, is longer or shorter than before, or is open again."""
-        place = obstacle.lane, obstacle.from_m, obstacle.vehicle, obstacle.since_s
+        place = obstacle.identity
         number = self._active.setdefault(place, len(self._figures))
         if number == len(self._figures):
             self._figures.append(

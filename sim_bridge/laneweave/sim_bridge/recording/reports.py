@@ -80,7 +80,7 @@ class ReportTotals:
     _processes: dict[Name, Counter[str]] = field(factory=dict)
     """Counters of the processes of these senders."""
     _kept_senders: set[tuple[Name, Name]] = field(factory=set)
-    """Senders that are no agents, whose reports are never final."""
+    """Senders other than agents; their newest reports are stored until the end."""
     _kept_processes: set[Name] = field(factory=set)
     """Their processes."""
     _solve_times: SolveTimes = field(factory=SolveTimes)

@@ -235,8 +235,8 @@ class Roadside:
         before, self._reported = self._reported, self.obstacles.at_rest
         if self._reported != before:
             yield from ((PART_CLOSED, one) for one in self._reported if one not in before)
-            now = {(one.lane, one.from_m, one.since_s) for one in self._reported}
-            gone = (one for one in before if (one.lane, one.from_m, one.since_s) not in now)
+            now = {one.identity for one in self._reported}
+            gone = (one for one in before if one.identity not in now)
             yield from ((PART_OPENED, one) for one in gone)
 
     def _lanes_past(self, closed: Sequence[TemporaryClosure]) -> int | None:

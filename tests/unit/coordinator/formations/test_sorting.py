@@ -274,7 +274,7 @@ def test_all_placements_share_one_deadline() -> None:
 
 
 def test_a_placement_that_cannot_be_reached_is_followed_by_others() -> None:
-    """The nearest cell of the vehicle's lane is walled in; farther ones are not."""
+    """The nearest cell of the vehicle's lane is enclosed by blocked cells; farther ones are not."""
     cells = {A: (-3, 0), B: (-3, 1), C: (-2, 2)}
     order = task(cells, {A: 2, B: 1, C: 2}, B, C)
     first, second, *_ = plan_requests(order)

@@ -209,7 +209,7 @@ def test_a_ramp_begins_behind_edges_that_lead_elsewhere_too(
 
 @pytest.mark.parametrize("ends", [False, True])
 def test_a_ramp_begins_behind_an_edge_on_which_a_route_ends(network: Network, ends: bool) -> None:
-    """Not behind one from which a way leads back that nobody takes, as netconvert adds them."""
+    """Unused turnarounds, which netconvert adds, do not matter."""
     routes = [("first", "before", "on", "main4"), *([("first", "before")] if ends else [])]
     (ramp,) = corridor_of(with_way_out(network, "before", 0), "main1", "main5", routes).ramps
     assert [link.origin.edge for link in ramp.path] == (["on"] if ends else ["on", "before"])
@@ -219,7 +219,7 @@ def test_a_ramp_begins_behind_an_edge_on_which_a_route_ends(network: Network, en
 def test_a_ramp_begins_behind_edges_with_lanes_that_end(
     network: Network, edge: str, path: list[str]
 ) -> None:
-    """Vehicles in them would come to the ramp's lane after it has begun."""
+    """Vehicles in such lanes change to the ramp's lane behind its beginning."""
     lanes = network.edges[edge].lanes
     lanes = (*lanes, evolve(lanes[0], name=f"{edge}_1", index=1))
     edges = {**network.edges, edge: evolve(network.edges[edge], lanes=lanes)}

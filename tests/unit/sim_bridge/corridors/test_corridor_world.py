@@ -34,7 +34,7 @@ def test_closed_lanes_to_which_vehicles_come_are_refused_before_sumo_starts(
 
 
 def test_a_bus_that_comes_by_its_own_lane_is_seen(tmp_path: Path) -> None:
-    """No car may use the lane by which it comes, so it comes to none of the entrances."""
+    """Entrances are reached in lanes for cars, and the bus comes in a lane of its own."""
     vehicles = [vehicle("bus", 0, "upstream", "bus")]
     vehicles += [vehicle(f"m{n}", 1 + n, "main" if n % 3 else "upstream") for n in range(12)]
     config = write_interchange(tmp_path, vehicles, types=BUS)

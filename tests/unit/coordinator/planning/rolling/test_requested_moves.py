@@ -53,7 +53,7 @@ def test_of_two_requests_for_one_cell_that_of_the_vehicle_ahead_is_granted() -> 
 
 
 def test_a_refused_request_conflicts_with_no_other() -> None:
-    """The one ahead cannot be granted, so it keeps no other from moving."""
+    """A request that is refused itself keeps no other vehicle from moving."""
     assert grant({(40, 1): FORWARD, (42, 1): BACK, (43, 1): BACK}) == {(42, 1)}
 
 
